@@ -1,0 +1,121 @@
+"""Coefficients of a Lagrangian: learned (a dual variable with bounds and its own optimiser) or fixed."""
+
+import math
+from typing import Any
+
+import torch as th
+
+from sb3_gac.common.losses import dual_loss
+
+
+class FixedCoefficient:
+    """
+    A coefficient that stays what it is.
+
+    :param value: the coefficient, not negative
+    :param device: where its tensor lives
+    """
+
+    def __init__(self, value: float, device: th.device):
+        self.value = th.tensor(float(value), device=device)
+        self.optimizer: th.optim.Optimizer | None = None
+        self.state_names: tuple[list[str], list[str]] = ([], ["value"])
+
+    def update(self, violation: th.Tensor) -> dict[str, th.Tensor]:
+        """Nothing to learn, nothing to log."""
+        return {}
+
+
+class DualVariable:
+    """
+    A positive coefficient learned in log space by gradient steps on :func:`dual_loss`, kept inside bounds.
+
+    :param initial: start value, inside the bounds
+    :param bounds: smallest and largest value
+    :param learning_rate: Adam's, on the logarithm
+    :param device: where its tensor lives
+    """
+
+    def __init__(self, initial: float, bounds: tuple[float, float], learning_rate: float, device: th.device):
+        self.bounds = bounds
+        self._log_bounds = (math.log(bounds[0]), math.log(bounds[1]))
+        self.log_value = th.full((1,), math.log(initial), device=device, requires_grad=True)
+        self.optimizer: th.optim.Optimizer | None = th.optim.Adam([self.log_value], lr=learning_rate)
+        self.state_names: tuple[list[str], list[str]] = (["optimizer"], ["log_value"])
+
+    @property
+    def value(self) -> th.Tensor:
+        """The coefficient, detached, shape (1,)."""
+        return self.log_value.detach().exp()
+
+    def update(self, violation: th.Tensor) -> dict[str, th.Tensor]:
+        """
+        One gradient step: up while the mean violation is positive, down while it is negative.
+
+        :param violation: constraint violation per sample, shape (\\*E)
+        :return: "loss", and "on_bound": 1 if the coefficient sits on one of its bounds, else 0
+        """
+        assert self.optimizer is not None
+        loss = dual_loss(self.log_value, violation)
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        with th.no_grad():
+            self.log_value.clamp_(*self._log_bounds)
+            on_bound = (self.log_value <= self._log_bounds[0]) | (self.log_value >= self._log_bounds[1])
+        return {"loss": loss.detach(), "on_bound": on_bound.float().mean()}
+
+
+Coefficient = FixedCoefficient | DualVariable
+
+
+def make_coefficient(
+    name: str,
+    spec: str | float,
+    auto_value: float,
+    bounds: tuple[float, float],
+    learning_rate: float,
+    device: th.device,
+) -> Coefficient:
+    """
+    Build a coefficient from what the user wrote.
+
+    :param name: constructor argument, for error messages
+    :param spec: "auto", "auto_<start value>" or a number
+    :param auto_value: start value for "auto"
+    :param bounds: smallest and largest value of a learned coefficient
+    :param learning_rate: of a learned coefficient
+    :param device: where its tensor lives
+    :raises ValueError: if ``spec`` or ``bounds`` is none of what is allowed
+    """
+    remedy = f'{name} must be "auto", "auto_<start value>" such as "auto_0.5", or a number >= 0, got {spec!r}.'
+    low, high = check_bounds(f"{name}_bounds", bounds)
+    if not (isinstance(spec, str) and spec.startswith("auto")):
+        return FixedCoefficient(_parse(spec, remedy, allow_zero=True), device)
+    initial = auto_value if spec == "auto" else _parse(spec.removeprefix("auto_"), remedy, allow_zero=False)
+    if spec != "auto" and not low <= initial <= high:
+        raise ValueError(f"The start value of {name}={spec!r} lies outside {name}_bounds={bounds}.")
+    return DualVariable(min(max(initial, low), high), (low, high), learning_rate, device)
+
+
+def check_bounds(name: str, bounds: Any) -> tuple[float, float]:
+    """
+    :raises ValueError: unless ``bounds`` are two numbers with 0 < low < high
+    """
+    try:
+        low, high = (float(bound) for bound in bounds)
+    except (TypeError, ValueError):
+        low, high = 0.0, 0.0
+    if not 0 < low < high < math.inf:
+        raise ValueError(f"{name} must be a pair (low, high) with 0 < low < high, got {bounds!r}.")
+    return low, high
+
+
+def _parse(text: Any, remedy: str, allow_zero: bool) -> float:
+    try:
+        number = float(text)
+    except (TypeError, ValueError):
+        raise ValueError(remedy) from None
+    if not math.isfinite(number) or number < 0 or (number == 0 and not allow_zero):
+        raise ValueError(remedy)
+    return number

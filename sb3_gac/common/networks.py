@@ -1,0 +1,107 @@
+"""Building blocks of the policies: an ensemble of Q-networks evaluated at once."""
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+
+class RoleModel(BaseModel):
+    """A network that reads only the observation entries of its role, whatever else the observation holds."""
+
+    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
+        """
+        :param obs: observation with at least the entries of this role
+        :param features_extractor: the role's extractor
+        :return: shape (B, F)
+        """
+        assert isinstance(self.observation_space, spaces.Dict)
+        return super().extract_features({key: obs[key] for key in self.observation_space.spaces}, features_extractor)
+
+
+class EnsembleLinear(nn.Module):
+    """
+    ``n_members`` linear layers in one batched product, each initialised like ``torch.nn.Linear``.
+
+    :param n_members: size of the ensemble, N
+    :param in_features: F
+    :param out_features: H
+    """
+
+    def __init__(self, n_members: int, in_features: int, out_features: int):
+        super().__init__()
+        bound = in_features**-0.5
+        self.weight = nn.Parameter(th.empty(n_members, in_features, out_features).uniform_(-bound, bound))
+        self.bias = nn.Parameter(th.empty(n_members, 1, out_features).uniform_(-bound, bound))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: shape (N, B, F)
+        :return: shape (N, B, H)
+        """
+        return th.baddbmm(self.bias, x, self.weight)
+
+
+class CriticEnsemble(RoleModel):
+    """
+    Q-networks on the entries of one role, evaluated together.
+
+    :param observation_space: the entries that this role reads
+    :param action_space: Box
+    :param net_arch: hidden layer sizes
+    :param features_extractor: encoder of the entries
+    :param features_dim: its output size, F
+    :param activation_fn: between layers
+    :param normalize_images: divide images by 255
+    :param n_critics: size of the ensemble, N
+    """
+
+    features_extractor: BaseFeaturesExtractor
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        normalize_images: bool = True,
+        n_critics: int = 2,
+    ):
+        super().__init__(
+            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+        )
+        self.net_arch = net_arch
+        self.features_dim = features_dim
+        self.activation_fn = activation_fn
+        self.n_critics = n_critics
+        sizes = [features_dim + get_action_dim(action_space), *net_arch]
+        layers: list[nn.Module] = []
+        for in_features, out_features in zip(sizes[:-1], sizes[1:], strict=True):
+            layers += [EnsembleLinear(n_critics, in_features, out_features), activation_fn()]
+        self.q_networks = nn.Sequential(*layers, EnsembleLinear(n_critics, sizes[-1], 1))
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """
+        :param obs: observation with at least the entries of this role, B of each
+        :param actions: in [-1, 1], shape (B, A)
+        :return: shape (N, B)
+        """
+        features = self.extract_features(obs, self.features_extractor)
+        x = th.cat([features, actions], dim=-1)
+        return self.q_networks(x.expand(self.n_critics, *x.shape)).squeeze(-1)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {
+            "net_arch": self.net_arch,
+            "features_extractor": self.features_extractor,
+            "features_dim": self.features_dim,
+            "activation_fn": self.activation_fn,
+            "n_critics": self.n_critics,
+        }

@@ -1,0 +1,428 @@
+"""Guider, learner and four critics: the networks of Guided Actor-Critic for Box actions."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+from torch import nn
+
+from sb3_gac.common.distributions import TanhGaussian, project_to_kl_ball
+from sb3_gac.common.networks import CriticEnsemble, RoleModel
+from sb3_gac.common.roles import RoleKeys, resolve_net_arch, resolve_role_keys, role_space
+
+DELTA_INIT_SCALE = 0.01
+LOG_STD_BOUNDS = (-5.0, 1.0)
+
+
+class RolePolicy(RoleModel, BasePolicy):
+    """
+    A policy network on the entries of its role: encoder and hidden layers; subclasses add the heads.
+
+    :param observation_space: the entries that this role reads
+    :param action_space: Box
+    :param net_arch: hidden layer sizes
+    :param features_extractor: encoder of the entries
+    :param features_dim: its output size
+    :param activation_fn: between layers
+    :param normalize_images: divide images by 255
+    :param log_std_bounds: smallest and largest log standard deviation before tanh
+    """
+
+    features_extractor: BaseFeaturesExtractor
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        normalize_images: bool = True,
+        log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.net_arch = net_arch
+        self.features_dim = features_dim
+        self.activation_fn = activation_fn
+        self.log_std_bounds = log_std_bounds
+        self.latent_net = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
+        latent_dim = net_arch[-1] if net_arch else features_dim
+        action_dim = get_action_dim(action_space)
+        self.mean = nn.Linear(latent_dim, action_dim)
+        self.log_std = nn.Linear(latent_dim, action_dim)
+
+    def latent(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        :param obs: observation with at least the entries of this role, B of each
+        :return: last hidden layer, shape (B, H)
+        """
+        return self.latent_net(self.extract_features(obs, self.features_extractor))
+
+    def bounded_log_std(self, latent: th.Tensor) -> th.Tensor:
+        """
+        :param latent: shape (B, H)
+        :return: log standard deviation before tanh, shape (B, A)
+        """
+        return self.log_std(latent).clamp(*self.log_std_bounds)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {
+            "net_arch": self.net_arch,
+            "features_extractor": self.features_extractor,
+            "features_dim": self.features_dim,
+            "activation_fn": self.activation_fn,
+            "log_std_bounds": self.log_std_bounds,
+        }
+
+
+class Learner(RolePolicy):
+    """
+    The deployed policy: a mean on the learner's entries.
+
+    In training it borrows the guider's std. Its own log-std head, fitted to the guider's, serves
+    ``predict(deterministic=False)`` where there is no guider.
+    """
+
+    def forward(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param obs: observation with at least the learner's entries, B of each
+        :return: mean before tanh, and the deployment log std, whose gradient stops at its head; both (B, A)
+        """
+        latent = self.latent(obs)
+        return self.mean(latent), self.bounded_log_std(latent.detach())
+
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """
+        :param observation: single or batched; a dict with at least the learner's entries, or, where the learner reads
+            one entry, that entry alone
+        :return: tensors of the learner's entries, and whether they were batched
+        :raises ValueError: if one of the learner's entries is missing
+        """
+        return super().obs_to_tensor(self._own_entries(observation))
+
+    def _own_entries(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        assert isinstance(self.observation_space, spaces.Dict)
+        keys = list(self.observation_space.spaces)
+        if not isinstance(observation, Mapping):
+            if len(keys) > 1:
+                raise ValueError(f"The learner reads {keys}: pass predict() a dict with these entries, not an array.")
+            return {keys[0]: observation}
+        missing = [key for key in keys if key not in observation]
+        if missing:
+            raise ValueError(f"The observation passed to predict() lacks {missing}, which the learner reads.")
+        return {key: observation[key] for key in keys}
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        action = TanhGaussian(*self(observation))
+        return action.mode if deterministic else action.sample()
+
+
+class Guider(RolePolicy):
+    """
+    The privileged policy in the paper's form: mean and std from its own network, nothing shared with the learner.
+
+    :param max_kl: hard bound on KL(guider || learner), or ``None``: the mean is projected onto that ball
+    :param kl_reduction: how the bounded KL is reduced over action dimensions
+    """
+
+    def __init__(self, *args: Any, max_kl: float | None = None, kl_reduction: str = "mean", **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.max_kl = max_kl
+        self.kl_reduction = kl_reduction
+
+    def forward(self, obs: PyTorchObs, learner_mean: th.Tensor) -> TanhGaussian:
+        """
+        :param obs: observation with at least the guider's entries, B of each
+        :param learner_mean: the learner's mean for the same observations; treated as a constant, shape (B, A)
+        :return: action distribution, shapes (B, A)
+        """
+        latent = self.latent(obs)
+        log_std = self.bounded_log_std(latent)
+        mean = self._guided_mean(self.mean(latent), learner_mean.detach(), log_std.detach().exp())
+        return TanhGaussian(mean, log_std)
+
+    def _guided_mean(self, output: th.Tensor, learner_mean: th.Tensor, std: th.Tensor) -> th.Tensor:
+        if self.max_kl is None:
+            return output
+        offset = project_to_kl_ball((output - learner_mean) / std, self.max_kl, self.kl_reduction)
+        return learner_mean + std * offset
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        raise TypeError("The guider is defined relative to the learner: use GAC.predict_guider().")
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {"max_kl": self.max_kl, "kl_reduction": self.kl_reduction}
+
+
+class ResidualGuider(Guider):
+    """
+    The guider as the learner plus a privileged correction delta in units of the std: KL = 1/2 ||delta||^2 exactly.
+
+    Neither the learner's drift nor a shrinking std moves the KL; delta = 0 is the learner itself.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        with th.no_grad():
+            self.mean.weight.mul_(DELTA_INIT_SCALE)
+            self.mean.bias.mul_(DELTA_INIT_SCALE)
+
+    def _guided_mean(self, output: th.Tensor, learner_mean: th.Tensor, std: th.Tensor) -> th.Tensor:
+        delta = output if self.max_kl is None else project_to_kl_ball(output, self.max_kl, self.kl_reduction)
+        return learner_mean + std * delta
+
+
+GUIDERS: dict[str, type[Guider]] = {"residual": ResidualGuider, "independent": Guider}
+
+
+class GACPolicy(BasePolicy):
+    """
+    All networks of GAC and their optimisers. As a policy it is the learner: ``predict`` needs its entries alone.
+
+    :param observation_space: Dict
+    :param action_space: Box
+    :param lr_schedule: learning rate schedule
+    :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}`` or ``{"guider", "learner", "critic"}``
+    :param activation_fn: between layers
+    :param guider: "residual" or "independent", a key of ``GUIDERS``
+    :param role_keys: role -> observation entries, see :func:`sb3_gac.common.roles.resolve_role_keys`
+    :param max_kl: hard bound on KL(guider || learner), or ``None``
+    :param kl_reduction: how that KL is reduced over action dimensions, "mean" or "sum"
+    :param learner_critics: whether the learner has critics of its own
+    :param log_std_bounds: smallest and largest log standard deviation before tanh
+    :param features_extractor_class: encoder, made once per role on the entries of that role
+    :param features_extractor_kwargs: keyword arguments for it
+    :param normalize_images: divide images by 255
+    :param optimizer_class: optimiser of policies and critics
+    :param optimizer_kwargs: keyword arguments for it, without the learning rate
+    :param n_critics: size of each of the two critic ensembles
+    """
+
+    learner_critic: CriticEnsemble | None
+    learner_critic_target: CriticEnsemble | None
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        guider: str = "residual",
+        role_keys: RoleKeys | None = None,
+        max_kl: float | None = None,
+        kl_reduction: str = "mean",
+        learner_critics: bool = True,
+        log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
+        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_critics: int = 2,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            features_extractor_kwargs,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=True,
+            normalize_images=normalize_images,
+        )
+        self.constructor_options: dict[str, Any] = {
+            "net_arch": net_arch,
+            "activation_fn": activation_fn,
+            "guider": guider,
+            "role_keys": role_keys,
+            "max_kl": max_kl,
+            "kl_reduction": kl_reduction,
+            "learner_critics": learner_critics,
+            "log_std_bounds": log_std_bounds,
+            "n_critics": n_critics,
+        }
+        self.role_keys = resolve_role_keys(observation_space, role_keys)
+        self._net_arch = resolve_net_arch(net_arch)
+        self._build_networks(GUIDERS[guider], max_kl, kl_reduction, learner_critics, log_std_bounds, n_critics)
+        self._build_optimizers(lr_schedule)
+
+    def _build_networks(
+        self,
+        guider_class: type[Guider],
+        max_kl: float | None,
+        kl_reduction: str,
+        learner_critics: bool,
+        log_std_bounds: tuple[float, float],
+        n_critics: int,
+    ) -> None:
+        self.learner = Learner(**self._role_kwargs("learner"), log_std_bounds=log_std_bounds)
+        self.guider = guider_class(
+            **self._role_kwargs("guider"), log_std_bounds=log_std_bounds, max_kl=max_kl, kl_reduction=kl_reduction
+        )
+        self.guider_critic, self.guider_critic_target = self._make_critic_and_target("guider_critic", n_critics)
+        self.learner_critic, self.learner_critic_target = None, None
+        if learner_critics:
+            self.learner_critic, self.learner_critic_target = self._make_critic_and_target("learner_critic", n_critics)
+
+    def _role_kwargs(self, role: str) -> dict[str, Any]:
+        """Constructor arguments of a role's network, with a features extractor of its own."""
+        space = role_space(self.observation_space, self.role_keys[role])  # type: ignore[arg-type]
+        features_extractor = self.features_extractor_class(space, **self.features_extractor_kwargs)
+        return {
+            "observation_space": space,
+            "action_space": self.action_space,
+            "net_arch": self._net_arch[role],
+            "features_extractor": features_extractor,
+            "features_dim": features_extractor.features_dim,
+            "activation_fn": self.constructor_options["activation_fn"],
+            "normalize_images": self.normalize_images,
+        }
+
+    def _make_critic_and_target(self, role: str, n_critics: int) -> tuple[CriticEnsemble, CriticEnsemble]:
+        critic = CriticEnsemble(**self._role_kwargs(role), n_critics=n_critics)
+        target = CriticEnsemble(**self._role_kwargs(role), n_critics=n_critics)
+        target.load_state_dict(critic.state_dict())
+        target.set_training_mode(False)
+        return critic, target
+
+    def _build_optimizers(self, lr_schedule: Schedule) -> None:
+        """One optimiser for the two policies and one for all critics: their losses never share a parameter."""
+        kwargs = dict(self.optimizer_kwargs)
+        if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
+            kwargs.setdefault("fused", True)
+        policies = [*self.guider.parameters(), *self.learner.parameters()]
+        critics = [parameter for critic, _ in self.critic_pairs for parameter in critic.parameters()]
+        self.actor_optimizer = self.optimizer_class(policies, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+        self.critic_optimizer = self.optimizer_class(critics, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+
+    @property
+    def actor(self) -> Learner:
+        """SB3's name for the policy that acts at evaluation."""
+        return self.learner
+
+    @property
+    def critic(self) -> CriticEnsemble:
+        """SB3's name for the critic without the KL term (eq. 15); the guided one in ablations that have no other."""
+        return self.guider_critic if self.learner_critic is None else self.learner_critic
+
+    @property
+    def critic_target(self) -> CriticEnsemble:
+        """Target of :attr:`critic`."""
+        return self.guider_critic_target if self.learner_critic_target is None else self.learner_critic_target
+
+    @property
+    def critic_pairs(self) -> list[tuple[CriticEnsemble, CriticEnsemble]]:
+        """(critic, target) of the guider, then of the learner where it has one."""
+        pairs = [(self.guider_critic, self.guider_critic_target)]
+        if self.learner_critic is not None and self.learner_critic_target is not None:
+            pairs.append((self.learner_critic, self.learner_critic_target))
+        return pairs
+
+    def distributions(self, obs: PyTorchObs) -> tuple[TanhGaussian, TanhGaussian, th.Tensor]:
+        """
+        Both policies' action distributions for one batch.
+
+        :param obs: full observation, B of each entry
+        :return: guider; learner with the guider's std, detached; and the learner's deployment log std, shape (B, A)
+        """
+        learner_mean, deployment_log_std = self.learner(obs)
+        guider = self.guider(obs, learner_mean)
+        return guider, TanhGaussian(learner_mean, guider.log_std.detach()), deployment_log_std
+
+    def guider_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
+        """
+        Action of the guider, in [-1, 1].
+
+        :param observation: full observation, single or batched
+        :param deterministic: mode instead of a sample
+        :return: shape (B, \\*action shape), and whether the observation was batched
+        """
+        obs, vectorized = self.obs_to_tensor(observation)
+        with th.no_grad():
+            guider = self.distributions(obs)[0]
+            action = guider.mode if deterministic else guider.sample()
+        return action.cpu().numpy().reshape(-1, *self.action_space.shape), vectorized  # type: ignore[misc]
+
+    def update_targets(self, tau: float) -> None:
+        """
+        Polyak averaging of the targets, tau theta + (1 - tau) theta_bar; running statistics are copied.
+
+        :param tau: in [0, 1]
+        """
+        for critic, target in self.critic_pairs:
+            polyak_update(critic.parameters(), target.parameters(), tau)
+            polyak_update(get_parameters_by_name(critic, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        The learner's action; entries that the learner does not read are ignored.
+
+        :param observation: single or batched; ``{"partial": ...}``, a full dict, or the partial entry alone
+        :param state: passed through
+        :param episode_start: ignored
+        :param deterministic: mode instead of a sample
+        :return: action in the environment's range, and ``state``
+        """
+        return self.learner.predict(observation, state, episode_start, deterministic)
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """The learner's action in [-1, 1], shape (B, A)."""
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.learner._predict(observation, deterministic)
+
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """
+        :param observation: dict of observation entries, single or batched; unknown entries are dropped
+        :return: tensors, and whether they were batched
+        """
+        if not isinstance(observation, Mapping):
+            return self.learner.obs_to_tensor(observation)
+        known = self.observation_space.spaces  # type: ignore[attr-defined]
+        return super().obs_to_tensor({key: value for key, value in observation.items() if key in known})
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Put policies and critics in training or evaluation mode; targets stay in evaluation mode.
+
+        :param mode: True for training
+        """
+        self.guider.set_training_mode(mode)
+        self.learner.set_training_mode(mode)
+        for critic, _ in self.critic_pairs:
+            critic.set_training_mode(mode)
+        self.training = mode
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | self.constructor_options | {
+            "lr_schedule": self._dummy_schedule,
+            "optimizer_class": self.optimizer_class,
+            "optimizer_kwargs": self.optimizer_kwargs,
+            "features_extractor_class": self.features_extractor_class,
+            "features_extractor_kwargs": self.features_extractor_kwargs,
+        }
+
+
+MultiInputPolicy = GACPolicy
