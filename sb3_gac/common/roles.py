@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 from gymnasium import spaces
 
-PARTIAL = "partial"
-PRIVILEGED = "privileged"
+from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
+
 ROLES = ("guider", "learner", "guider_critic", "learner_critic")
 
 RoleKeys = Mapping[str, Sequence[str]]

@@ -105,6 +105,10 @@ class Learner(RolePolicy):
         latent = self.latent(obs)
         return self.mean(latent), self.bounded_log_std(latent.detach())
 
+    def mean_parameters(self) -> list[nn.Parameter]:
+        """All parameters but those of the deployment log-std head, whose loss is another."""
+        return [parameter for name, parameter in self.named_parameters() if not name.startswith("log_std.")]
+
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """
         :param observation: single or batched; a dict with at least the learner's entries, or, where the learner reads
@@ -305,9 +309,8 @@ class GACPolicy(BasePolicy):
         kwargs = dict(self.optimizer_kwargs)
         if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
             kwargs.setdefault("fused", True)
-        policies = [*self.guider.parameters(), *self.learner.parameters()]
         critics = [parameter for critic, _ in self.critic_pairs for parameter in critic.parameters()]
-        self.actor_optimizer = self.optimizer_class(policies, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+        self.actor_optimizer = self.optimizer_class(self.actor_parameters(), lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
         self.critic_optimizer = self.optimizer_class(critics, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
 
     @property
@@ -333,6 +336,11 @@ class GACPolicy(BasePolicy):
             pairs.append((self.learner_critic, self.learner_critic_target))
         return pairs
 
+    def actor_parameters(self) -> list[nn.Parameter]:
+        """Trainable parameters of guider and learner."""
+        parameters = [*self.guider.parameters(), *self.learner.parameters()]
+        return [parameter for parameter in parameters if parameter.requires_grad]
+
     def distributions(self, obs: PyTorchObs) -> tuple[TanhGaussian, TanhGaussian, th.Tensor]:
         """
         Both policies' action distributions for one batch.
@@ -344,7 +352,7 @@ class GACPolicy(BasePolicy):
         guider = self.guider(obs, learner_mean)
         return guider, TanhGaussian(learner_mean, guider.log_std.detach()), deployment_log_std
 
-    def guider_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
+    def behaviour_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
         """
         Action of the guider, in [-1, 1].
 

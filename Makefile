@@ -1,0 +1,45 @@
+# Two commands do everything from a fresh clone: `make train` and `make test`.
+
+PYTHON ?= python3
+VENV ?= .venv
+TASK ?= HalfCheetah
+NOISE ?= 0.1
+STEPS ?= 50000
+SEED ?= 0
+RUNS ?= runs
+WORKERS ?= auto
+ARGS ?=
+
+BIN := $(VENV)/bin
+CODE := sb3_gac benchmarks tests
+
+.PHONY: train test format lint type clean
+
+$(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	touch $@
+
+train: $(VENV)/.installed  ## train GAC, evaluate the learner on partial alone, save everything under runs/
+	$(BIN)/python -m sb3_gac.train --task $(TASK) --noise $(NOISE) --steps $(STEPS) --seed $(SEED) --runs $(RUNS) $(ARGS)
+
+test: $(VENV)/.installed-dev  ## run the tests, several at a time
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(ARGS)
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff check --fix $(CODE)
+	$(BIN)/black $(CODE)
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check $(CODE)
+	$(BIN)/black --check $(CODE)
+
+type: $(VENV)/.installed-dev
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,127 @@
+"""Evaluation of guider and learner side by side."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+
+_WATCHED = ("train/kl", "train/target_kl", "train/kl_coef", "train/kl_coef_on_bound")
+
+
+class _GuiderPredictor:
+    """A model's guider, as something that SB3's ``evaluate_policy`` can evaluate."""
+
+    def __init__(self, model: Any):
+        self.predict = model.predict_guider
+
+
+class GuiderLearnerEvalCallback(EvalCallback):
+    """
+    Evaluate the learner, as ``EvalCallback`` does, and the guider on the same seeds (the paper's Figure 4).
+
+    Logs ``eval/mean_reward`` (learner) and ``eval/guider_mean_reward``, and keeps both in ``guider_evaluations.npz``
+    under ``log_path``.  Warns when the learner no longer follows the guider, that is, when ``patience`` evaluations in
+    a row find KL more than twice its target, the KL coefficient on a bound, or a guider that is clearly better.
+
+    :param eval_env: environment for evaluation
+    :param eval_seed: both policies are evaluated from these seeds, at every evaluation the same
+    :param patience: evaluations in a row before a warning
+    :param gap_tolerance: how much of the guider's mean return the learner may lack, beyond two standard errors
+    :param log_path: directory for results, ``None`` for none
+    :param kwargs: of ``EvalCallback``
+    """
+
+    def __init__(
+        self,
+        eval_env: gym.Env | VecEnv,
+        eval_seed: int = 10_000,
+        patience: int = 3,
+        gap_tolerance: float = 0.2,
+        log_path: str | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(eval_env, log_path=log_path, **kwargs)
+        self.eval_seed = eval_seed
+        self.patience = patience
+        self.gap_tolerance = gap_tolerance
+        self.history: list[dict[str, float]] = []
+        self._directory = None if log_path is None else Path(log_path)
+        self._watched: dict[str, float] = {}
+        self._in_a_row = {"kl": 0, "bound": 0, "gap": 0}
+        self._episode_returns: list[float] = []
+
+    def _on_rollout_start(self) -> None:
+        """Keep what the last gradient step logged: the logger forgets it at every dump."""
+        logged = self.logger.name_to_value
+        self._watched.update({name: logged[name] for name in _WATCHED if name in logged})
+
+    def _on_step(self) -> bool:
+        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+            return True
+        guider_returns = self._evaluate_guider()
+        self.eval_env.seed(self.eval_seed)
+        self._episode_returns = []
+        go_on = super()._on_step()
+        self._remember(guider_returns, np.array(self._episode_returns))
+        return go_on
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        super()._log_success_callback(locals_, globals_)
+        self._episode_returns = locals_["episode_rewards"]
+
+    def _evaluate_guider(self) -> np.ndarray:
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+        self.eval_env.seed(self.eval_seed)
+        returns, _ = evaluate_policy(
+            _GuiderPredictor(self.model),
+            self.eval_env,
+            n_eval_episodes=self.n_eval_episodes,
+            deterministic=self.deterministic,
+            return_episode_rewards=True,
+            warn=self.warn,
+        )
+        self.logger.record("eval/guider_mean_reward", float(np.mean(returns)))
+        return np.array(returns)
+
+    def _remember(self, guider_returns: np.ndarray, learner_returns: np.ndarray) -> None:
+        row = {"timesteps": self.num_timesteps, "learner": learner_returns.mean(), "guider": guider_returns.mean()}
+        self.history.append(row | {name.removeprefix("train/"): value for name, value in self._watched.items()})
+        if self._directory is not None:
+            np.savez(
+                self._directory / "guider_evaluations.npz",
+                **{name: np.array([entry.get(name, np.nan) for entry in self.history]) for name in self.history[-1]},
+            )
+        self._warn_if_not_following(guider_returns, learner_returns)
+
+    def _warn_if_not_following(self, guider_returns: np.ndarray, learner_returns: np.ndarray) -> None:
+        gap = guider_returns.mean() - learner_returns.mean()
+        noise = np.sqrt((guider_returns.var() + learner_returns.var()) / len(guider_returns))
+        kl, target_kl = self._watched.get("train/kl", 0.0), self._watched.get("train/target_kl", np.inf)
+        kl_coef = self._watched.get("train/kl_coef", np.nan)
+        found = {
+            "kl": (
+                kl > 2 * target_kl,
+                f"KL(guider || learner) is {kl:.2g}, {kl / target_kl:.1f} times its target: the learner does not keep up. "
+                'Use guider="residual", set a hard bound with max_kl, or raise target_kl.',
+            ),
+            "bound": (
+                self._watched.get("train/kl_coef_on_bound", 0.0) > 0.5,
+                f"kl_coef sits on a bound ({kl_coef:.2g}): it can no longer steer KL, which is {kl:.2g} for a target of "
+                f"{target_kl:.2g}. Widen kl_coef_bounds, or choose another target_kl.",
+            ),
+            "gap": (
+                gap > self.gap_tolerance * abs(guider_returns.mean()) + 2 * noise,
+                f"the guider returns {guider_returns.mean():.5g} and the learner {learner_returns.mean():.5g}: the learner "
+                "can't do what the guider does. Lower target_kl, or let the learner see more (for example a history).",
+            ),
+        }
+        for name, (is_so, message) in found.items():
+            self._in_a_row[name] = self._in_a_row[name] + 1 if is_so else 0
+            if self._in_a_row[name] == self.patience:
+                warnings.warn(f"After {self.num_timesteps} steps, {message}", stacklevel=2)

@@ -1,0 +1,58 @@
+"""Observation normalisation at deployment, where there is neither ``VecNormalize`` nor a privileged entry."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_gac.envs.spaces import PARTIAL
+
+
+class DeploymentNormalizer:
+    """
+    Normalise the learner's entries as ``VecNormalize`` did in training: clip((x - mean) / sqrt(var + epsilon)).
+
+    Picklable, and independent of the environment.
+
+    :param mean: entry -> mean
+    :param var: entry -> variance
+    :param epsilon: of ``VecNormalize``
+    :param clip_obs: of ``VecNormalize``
+    """
+
+    def __init__(self, mean: Mapping[str, np.ndarray], var: Mapping[str, np.ndarray], epsilon: float, clip_obs: float):
+        self.mean, self.var = dict(mean), dict(var)
+        self.epsilon = epsilon
+        self.clip_obs = clip_obs
+
+    @classmethod
+    def from_vec_normalize(cls, vec_normalize: VecNormalize, keys: Sequence[str] = (PARTIAL,)) -> "DeploymentNormalizer":
+        """
+        :param vec_normalize: wrapper of the training environments
+        :param keys: entries that the learner reads
+        :return: copy of the wrapper's statistics; entries that it does not normalise pass through unchanged
+        :raises ValueError: if the wrapper's statistics are not those of a Dict observation
+        """
+        statistics: Mapping[str, RunningMeanStd] = {}
+        if vec_normalize.norm_obs:
+            if not isinstance(vec_normalize.obs_rms, dict):
+                raise ValueError("vec_normalize must wrap environments with Dict observations.")
+            statistics = {key: vec_normalize.obs_rms[key] for key in keys if key in vec_normalize.obs_rms}
+        return cls(
+            {key: rms.mean.copy() for key, rms in statistics.items()},
+            {key: rms.var.copy() for key, rms in statistics.items()},
+            vec_normalize.epsilon,
+            vec_normalize.clip_obs,
+        )
+
+    def __call__(self, observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """
+        :param observation: raw, single or batched; other entries may be missing or present
+        :return: the same with the learner's entries normalised, float32
+        """
+        return {key: self._normalize(key, value) if key in self.mean else value for key, value in observation.items()}
+
+    def _normalize(self, key: str, value: np.ndarray) -> np.ndarray:
+        standardised = (value - self.mean[key]) / np.sqrt(self.var[key] + self.epsilon)
+        return np.clip(standardised, -self.clip_obs, self.clip_obs).astype(np.float32)

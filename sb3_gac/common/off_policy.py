@@ -1,0 +1,313 @@
+"""What off-policy algorithms with a privileged view share: acting, the train loop, logging, checks and save lists."""
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs
+
+from sb3_gac.common.checks import (
+    UnsupportedActionSpaceError,
+    check_finite_observation,
+    check_positive,
+    check_terminal_observations,
+)
+from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
+from sb3_gac.common.roles import RoleKeys, resolve_role_keys
+
+ENT_COEF_START = 0.1
+ENT_COEF_BOUNDS = (1e-8, 1e4)
+
+Metrics = dict[str, th.Tensor]
+
+
+class Batch(NamedTuple):
+    """
+    A batch of transitions.
+
+    :param observations: dict of entries, B of each
+    :param actions: in [-1, 1], shape (B, A)
+    :param rewards: shape (B,)
+    :param next_observations: dict of entries, B of each
+    :param dones: 1 where the episode terminated, 0 where it went on or ran into its time limit, shape (B,)
+    :param discounts: gamma to the number of steps that the reward sums up, scalar or shape (B,)
+    """
+
+    observations: PyTorchObs
+    actions: th.Tensor
+    rewards: th.Tensor
+    next_observations: PyTorchObs
+    dones: th.Tensor
+    discounts: th.Tensor | float
+
+
+def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float | None) -> th.Tensor:
+    """
+    Scale gradients in place to a norm of at most ``max_norm``, without waiting for the device.
+
+    :param parameters: of one network; those without a gradient are left alone
+    :param max_norm: ``None`` leaves the gradients as they are
+    :return: norm before clipping, scalar
+    """
+    with_gradient = [parameter for parameter in parameters if parameter.grad is not None]
+    norm = th.nn.utils.get_total_norm([parameter.grad for parameter in with_gradient])  # type: ignore[misc]
+    if max_norm is not None:
+        th.nn.utils.clip_grads_with_norm_(with_gradient, max_norm, norm)
+    return norm
+
+
+class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
+    """
+    Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
+
+    A subclass names its policy class in ``policy_aliases`` and writes one gradient step.
+
+    :param policy: "MultiInputPolicy", or a policy class
+    :param env: environment with Dict observations and Box actions
+    :param ent_coef: "auto", "auto_<start value>" or a number: entropy temperature
+    :param target_entropy: "auto" for -0.5 per action dimension, "sac" for SAC's -1 per dimension, or a number
+    :param target_update_interval: gradient steps between two updates of the target networks
+    :param max_grad_norm: bound on the gradient norm of each network, ``None`` for no bound
+    :param role_keys: role -> observation entries, where they differ from the default
+    :param kwargs: arguments of SB3's ``OffPolicyAlgorithm``
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None,
+        ent_coef: str | float = "auto",
+        target_entropy: str | float = "auto",
+        target_update_interval: int = 1,
+        max_grad_norm: float | None = 1.0,
+        role_keys: RoleKeys | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(policy, env, support_multi_env=True, sde_support=False, **kwargs)  # type: ignore[arg-type]
+        self.ent_coef = ent_coef
+        self.target_entropy = target_entropy
+        self.target_update_interval = target_update_interval
+        self.max_grad_norm = max_grad_norm
+        self.role_keys = role_keys
+
+    # --- set-up -----------------------------------------------------------------------------------------------------
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(
+                f'policy must be one of {list(self.policy_aliases)} or a policy class, got "{policy_name}": '
+                f'{type(self).__name__} works on Dict observations, for which SB3\'s name is "MultiInputPolicy".'
+            )
+        return self.policy_aliases[policy_name]
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        user_policy_kwargs = self.policy_kwargs
+        self.policy_kwargs = {**self._policy_options(), **user_policy_kwargs}
+        try:
+            super()._setup_model()
+        finally:
+            self.policy_kwargs = user_policy_kwargs  # saved as the user gave them
+        self._setup_coefficients()
+
+    def _check_arguments(self) -> None:
+        """
+        :raises ValueError: naming the argument and the remedy
+        """
+        if not isinstance(self.action_space, spaces.Box):
+            raise UnsupportedActionSpaceError(
+                f"{type(self).__name__} supports Box action spaces only, but the environment has {self.action_space}. "
+                "Wrap the environment so that its actions are continuous."
+            )
+        resolve_role_keys(self.observation_space, self.role_keys)
+        check_positive("target_update_interval", self.target_update_interval)
+        if self.max_grad_norm is not None:
+            check_positive("max_grad_norm", self.max_grad_norm, remedy="or None for no clipping")
+        self.target_entropy = self._resolve_target_entropy()
+
+    def _resolve_target_entropy(self) -> float:
+        per_dimension = {"auto": -0.5, "sac": -1.0}
+        if isinstance(self.target_entropy, str) and self.target_entropy in per_dimension:
+            return per_dimension[self.target_entropy] * float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+        try:
+            return float(self.target_entropy)
+        except (TypeError, ValueError):
+            raise ValueError(f'target_entropy must be "auto", "sac" or a number, got {self.target_entropy!r}.') from None
+
+    def _policy_options(self) -> dict[str, Any]:
+        """Arguments of the policy class that are arguments of the algorithm."""
+        return {"role_keys": self.role_keys}
+
+    def _setup_coefficients(self) -> None:
+        self.ent_coef_dual: Coefficient = make_coefficient(
+            "ent_coef", self.ent_coef, ENT_COEF_START, ENT_COEF_BOUNDS, self.lr_schedule(1), self.device
+        )
+
+    # --- SB3's names ------------------------------------------------------------------------------------------------
+
+    @property
+    def actor(self) -> th.nn.Module:  # type: ignore[override]
+        """The deployed policy."""
+        return self.policy.actor  # type: ignore[return-value]
+
+    @property
+    def critic(self) -> th.nn.Module:
+        """The critics that the deployed policy climbs."""
+        return self.policy.critic  # type: ignore[return-value]
+
+    @property
+    def critic_target(self) -> th.nn.Module:
+        """Target of :attr:`critic`."""
+        return self.policy.critic_target  # type: ignore[return-value]
+
+    @property
+    def log_ent_coef(self) -> th.Tensor | None:
+        """Logarithm of a learned entropy temperature; ``None`` if it is fixed."""
+        return self.ent_coef_dual.log_value if isinstance(self.ent_coef_dual, DualVariable) else None
+
+    @property
+    def ent_coef_tensor(self) -> th.Tensor:
+        """The entropy temperature."""
+        return self.ent_coef_dual.value
+
+    @property
+    def ent_coef_optimizer(self) -> th.optim.Optimizer | None:
+        """Optimiser of a learned entropy temperature."""
+        return self.ent_coef_dual.optimizer
+
+    # --- acting -----------------------------------------------------------------------------------------------------
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Uniform during warm-up, then the behaviour policy, which sees everything.
+
+        :param learning_starts: steps of warm-up
+        :param action_noise: added to the scaled action, which is then clipped
+        :param n_envs: number of environments
+        :return: action for the environments, and the same scaled to [-1, 1] for the buffer
+        """
+        if self.num_timesteps < learning_starts:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        assert self._last_obs is not None
+        scaled_action, _ = self.policy.behaviour_action(self._last_obs)  # type: ignore[operator]
+        if action_noise is not None:
+            scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
+        return self.policy.unscale_action(scaled_action), scaled_action
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, Any]:
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        assert isinstance(self._last_obs, dict)
+        self._forget_episode_on_error(check_finite_observation, self._last_obs)
+        return result
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        raw_obs = new_obs if self._vec_normalize_env is None else self._vec_normalize_env.get_original_obs()
+        self._forget_episode_on_error(check_finite_observation, raw_obs)
+        self._forget_episode_on_error(check_finite_observation, {"reward": reward}, what="The environment's")
+        self._forget_episode_on_error(check_terminal_observations, dones, infos)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _forget_episode_on_error(self, check: Any, *args: Any, **kwargs: Any) -> None:
+        """A refused observation ends the episode: the next ``learn()`` resets the environment and keeps the rest."""
+        try:
+            check(*args, **kwargs)
+        except ValueError:
+            self._last_obs = None
+            raise
+
+    # --- training ---------------------------------------------------------------------------------------------------
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """
+        :param gradient_steps: number of gradient steps
+        :param batch_size: transitions per step, B
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self._scheduled_optimizers())
+        history: list[Metrics] = []
+        for _ in range(gradient_steps):
+            history.append(self._gradient_step(self._sample_batch(batch_size)))
+            self._n_updates += 1
+            if self._n_updates % self.target_update_interval == 0:
+                self.policy.update_targets(self.tau)  # type: ignore[operator]
+        self._record_metrics(history)
+
+    @abstractmethod
+    def _gradient_step(self, batch: Batch) -> Metrics:
+        """
+        One update of all networks but the targets.
+
+        :param batch: B transitions
+        :return: detached scalars to log under "train/", left on the device
+        """
+
+    def _sample_batch(self, batch_size: int) -> Batch:
+        assert self.replay_buffer is not None
+        samples = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+        return Batch(
+            samples.observations,  # type: ignore[arg-type]
+            samples.actions,
+            samples.rewards.flatten(),
+            samples.next_observations,  # type: ignore[arg-type]
+            samples.dones.flatten(),
+            self.gamma if samples.discounts is None else samples.discounts.flatten(),
+        )
+
+    def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
+        """Optimisers that follow ``learning_rate``."""
+        optimizers = [self.policy.actor_optimizer, self.policy.critic_optimizer, self.ent_coef_optimizer]
+        return [optimizer for optimizer in optimizers if optimizer is not None]  # type: ignore[misc]
+
+    def _record_metrics(self, history: list[Metrics]) -> None:
+        """Log means over the gradient steps of one ``train()``: the only host transfer there is."""
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if not history:
+            return
+        names = list(history[0])
+        values = th.stack([th.stack([step[name].reshape(()) for name in names]) for step in history]).mean(dim=0)
+        for name, value in zip(names, values.tolist(), strict=True):
+            self.logger.record(f"train/{name}", value)
+
+    # --- save and load ----------------------------------------------------------------------------------------------
+
+    def _dual_names(self) -> list[str]:
+        """Attributes that hold coefficients."""
+        return ["ent_coef_dual"]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *self._dual_names()]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", "policy.actor_optimizer", "policy.critic_optimizer"]
+        tensors = []
+        for dual in self._dual_names():
+            dual_state_dicts, dual_tensors = getattr(self, dual).state_names
+            state_dicts += [f"{dual}.{name}" for name in dual_state_dicts]
+            tensors += [f"{dual}.{name}" for name in dual_tensors]
+        return state_dicts, tensors

@@ -1,0 +1,99 @@
+"""
+MuJoCo locomotion with noisy positions: gymnasium's v5 tasks, split as in the paper's Table 7 where v5 allows.
+
+=======================  ====================================================  =======  ========================
+task                     v5 observation                                        partial  privileged="velocity"
+=======================  ====================================================  =======  ========================
+HalfCheetah              qpos[1:] 8, qvel 9                                    8        9
+Ant                      qpos[2:] 13, qvel 14 (no contact forces)              13       14
+Humanoid(Standup)        qpos 22, qvel 23, cinert 130, cvel 78, actuator 17    169      101 = qvel, cvel
+InvertedDoublePendulum   x, sin 2, cos 2, qvel 3 (constraint force dropped)    5        3
+Hopper                   qpos[1:] 5, qvel 6 (clipped to +-10)                  5        6
+Walker2d                 qpos[1:] 8, qvel 9 (clipped to +-10)                  8        9
+Swimmer                  qpos[2:] 3, qvel 5                                    3        5
+=======================  ====================================================  =======  ========================
+
+``privileged="state"`` is the whole clean state: the velocities, and what ``partial`` shows, without its noise.  These
+are equivalents of the paper's Brax tasks, not reproductions: time step and control ranges are gymnasium's.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_gac.envs.wrappers import SensorNoise, SplitObservation
+
+PRIVILEGED_CHOICES = ("state", "velocity")
+
+
+@dataclass(frozen=True)
+class TaskLayout:
+    """
+    Where a task's observation holds what.
+
+    :param env_id: gymnasium's id
+    :param partial: indices of positions and other quantities without velocities
+    :param velocity: indices of velocities
+    :param kwargs: of ``gymnasium.make``
+    """
+
+    env_id: str
+    partial: tuple[int, ...]
+    velocity: tuple[int, ...]
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+def _positions_first(env_id: str, n_positions: int, n_velocities: int, **kwargs: Any) -> TaskLayout:
+    size = n_positions + n_velocities
+    return TaskLayout(env_id, tuple(range(n_positions)), tuple(range(n_positions, size)), kwargs)
+
+
+def _humanoid(env_id: str) -> TaskLayout:
+    """The layout qpos 0:22, qvel 22:45, cinert 45:175, cvel 175:253, qfrc_actuator 253:270, without contact forces."""
+    partial = (*range(22), *range(45, 175), *range(253, 270))
+    velocity = (*range(22, 45), *range(175, 253))
+    return TaskLayout(env_id, partial, velocity, {"include_cfrc_ext_in_observation": False})
+
+
+TASKS: dict[str, TaskLayout] = {
+    "HalfCheetah": _positions_first("HalfCheetah-v5", 8, 9),
+    "Ant": _positions_first("Ant-v5", 13, 14, include_cfrc_ext_in_observation=False),
+    "Humanoid": _humanoid("Humanoid-v5"),
+    "HumanoidStandup": _humanoid("HumanoidStandup-v5"),
+    "InvertedDoublePendulum": _positions_first("InvertedDoublePendulum-v5", 5, 3),
+    "Hopper": _positions_first("Hopper-v5", 5, 6),
+    "Walker2d": _positions_first("Walker2d-v5", 8, 9),
+    "Swimmer": _positions_first("Swimmer-v5", 3, 5),
+}
+
+
+def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", **kwargs: Any) -> gym.Env:
+    """
+    Build a task without its time limit, which ``gymnasium.make("sb3_gac/<task>-v5")`` adds.
+
+    :param task: a key of ``TASKS``
+    :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
+    :param privileged: "state" for the whole clean state, "velocity" for velocities alone
+    :param kwargs: of the gymnasium environment
+    :raises ValueError: if the task or ``privileged`` is unknown, or ``noise_std`` negative
+    """
+    if task not in TASKS:
+        raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
+    if privileged not in PRIVILEGED_CHOICES:
+        raise ValueError(f"privileged must be one of {list(PRIVILEGED_CHOICES)}, got {privileged!r}.")
+    layout = TASKS[task]
+    env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs})
+    visible = layout.velocity if privileged == "velocity" else tuple(sorted((*layout.partial, *layout.velocity)))
+    return SensorNoise(SplitObservation(env, layout.partial, visible), noise_std)
+
+
+def register_mujoco() -> None:
+    """Register ``sb3_gac/<task>-v5`` for every task, with gymnasium's time limit of 1,000 steps."""
+    for task in TASKS:
+        gym.register(
+            f"sb3_gac/{task}-v5",
+            entry_point="sb3_gac.envs.mujoco:make_mujoco",
+            max_episode_steps=1000,
+            kwargs={"task": task},
+        )

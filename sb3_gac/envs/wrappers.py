@@ -1,0 +1,239 @@
+"""
+Wrappers that split an observation into ``partial`` and ``privileged``, and make ``partial`` noisy or give it a memory.
+
+Each is a ``gymnasium.Wrapper``, picklable, and passes gymnasium's and SB3's environment checkers.  They compose::
+
+    env = SplitObservation(gym.make("HalfCheetah-v5"), partial=range(8), privileged=range(17))
+    env = History(SensorNoise(env, noise_std=0.1), length=4, actions=True)
+"""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, take_from_box
+
+KeySelection = Sequence[str] | Mapping[str, Sequence[int] | None]
+Observation = dict[str, np.ndarray]
+_NOISE_STREAM = 0x6E6F697365  # keeps the noise apart from generators that others seed with the same number
+
+
+class SplitObservation(gym.ObservationWrapper):
+    """
+    Split a flat Box observation by indices.
+
+    :param env: with a one-dimensional Box observation
+    :param partial: indices of what the deployed policy will see
+    :param privileged: indices of what only training sees; they may repeat those of ``partial``, where a clean copy
+        of what becomes noisy is wanted
+    :raises ValueError: if the observation is of another kind, or an index is outside it
+    """
+
+    def __init__(self, env: gym.Env, partial: Sequence[int], privileged: Sequence[int]):
+        super().__init__(env)
+        space = env.observation_space
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            raise ValueError(f"SplitObservation needs a one-dimensional Box observation, but the environment has {space}.")
+        self._indices = {
+            PARTIAL: _check_indices(PARTIAL, partial, space),
+            PRIVILEGED: _check_indices(PRIVILEGED, privileged, space),
+        }
+        self.observation_space = spaces.Dict({key: take_from_box(space, index) for key, index in self._indices.items()})
+
+    def observation(self, observation: np.ndarray) -> Observation:
+        """
+        :param observation: of the wrapped environment, shape (D,)
+        :return: ``partial`` and ``privileged``, float32
+        """
+        return {key: observation[index].astype(np.float32) for key, index in self._indices.items()}
+
+
+class SplitDictObservation(gym.ObservationWrapper):
+    """
+    Split a Dict observation, such as that of a goal environment, by keys; entries are flattened and concatenated.
+
+    :param env: with a flat Dict observation of Box entries
+    :param partial: keys of what the deployed policy will see; as a mapping, key -> indices into the flattened entry,
+        or ``None`` for all of it
+    :param privileged: likewise for what only training sees
+    :raises ValueError: if the observation is of another kind, or a key or an index is unknown
+    """
+
+    def __init__(self, env: gym.Env, partial: KeySelection, privileged: KeySelection):
+        super().__init__(env)
+        space = env.observation_space
+        if not isinstance(space, spaces.Dict):
+            raise ValueError(f"SplitDictObservation needs a Dict observation, but the environment has {space}.")
+        self._selections = {
+            PARTIAL: _check_keys(PARTIAL, partial, space),
+            PRIVILEGED: _check_keys(PRIVILEGED, privileged, space),
+        }
+        self.observation_space = spaces.Dict(
+            {
+                name: concatenate_boxes([take_from_box(box_entry(space, key), index) for key, index in keys.items()])
+                for name, keys in self._selections.items()
+            }
+        )
+
+    def observation(self, observation: Observation) -> Observation:
+        """
+        :param observation: of the wrapped environment
+        :return: ``partial`` and ``privileged``, one-dimensional, float32
+        """
+        return {
+            name: np.concatenate([np.ravel(observation[key])[index] for key, index in keys.items()], dtype=np.float32)
+            for name, keys in self._selections.items()
+        }
+
+
+class _EntryWrapper(gym.Wrapper):
+    """Base of wrappers that change one entry of a Dict observation."""
+
+    def __init__(self, env: gym.Env, key: str):
+        super().__init__(env)
+        self._key = key
+        self._entry = box_entry(env.observation_space, key)
+
+    def _set_entry_space(self, box: spaces.Box) -> None:
+        entries = self.env.observation_space.spaces  # type: ignore[attr-defined]
+        self.observation_space = spaces.Dict({**entries, self._key: box})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """
+        :param seed: of the environment, and of this wrapper's own random numbers, if it has any
+        :param options: of the environment
+        :return: changed observation, info
+        """
+        given = {name: value for name, value in {"seed": seed, "options": options}.items() if value is not None}
+        observation, info = self.env.reset(**given)  # not every environment knows both keywords
+        return {**observation, self._key: self._first(observation[self._key], seed)}, info
+
+    def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
+        """
+        :param action: of the environment
+        :return: changed observation, reward, terminated, truncated, info
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        changed = {**observation, self._key: self._next(observation[self._key], action)}
+        return changed, reward, terminated, truncated, info
+
+    def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
+        """The entry after a reset."""
+        raise NotImplementedError  # pragma: no cover
+
+    def _next(self, value: np.ndarray, action: Any) -> np.ndarray:
+        """The entry after a step."""
+        raise NotImplementedError  # pragma: no cover
+
+
+class SensorNoise(_EntryWrapper):
+    """
+    Add independent Gaussian noise N(0, noise_std^2) to one entry, drawn once per reset and per step.
+
+    The noise has a generator of its own, seeded by ``reset(seed=...)``: the environment's random numbers, and with
+    them its dynamics, are the same whatever ``noise_std`` is.
+
+    :param env: with a Dict observation
+    :param noise_std: standard deviation, in the units of the entry: a number, or one per component
+    :param key: the entry that becomes noisy
+    :raises ValueError: if ``noise_std`` is negative, or the entry is missing or of integers
+    """
+
+    def __init__(self, env: gym.Env, noise_std: float | Sequence[float], key: str = PARTIAL):
+        super().__init__(env, key)
+        self.noise_std = np.asarray(noise_std, dtype=np.float32)
+        if not (np.isfinite(self.noise_std).all() and (self.noise_std >= 0).all()):
+            raise ValueError(f"noise_std must be a finite number >= 0, or one per component, got {noise_std!r}.")
+        if not np.issubdtype(self._entry.dtype, np.floating):  # type: ignore[arg-type]
+            raise ValueError(f'SensorNoise needs a floating-point entry, but "{key}" has {self._entry}.')
+        noisy = np.broadcast_to(self.noise_std, self._entry.shape) > 0
+        low, high = np.where(noisy, -np.inf, self._entry.low), np.where(noisy, np.inf, self._entry.high)
+        dtype = self._entry.dtype
+        self._set_entry_space(spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype))  # type: ignore[arg-type]
+        self._generator = np.random.default_rng()
+
+    def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
+        if seed is not None:
+            self._generator = np.random.default_rng([seed, _NOISE_STREAM])
+        return self._noisy(value)
+
+    def _next(self, value: np.ndarray, action: Any) -> np.ndarray:
+        return self._noisy(value)
+
+    def _noisy(self, value: np.ndarray) -> np.ndarray:
+        noise = self._generator.standard_normal(value.shape, dtype=np.float32) * self.noise_std
+        return (value + noise).astype(value.dtype)
+
+
+class History(_EntryWrapper):
+    """
+    Replace one entry by its last ``length`` values, oldest first, joined along the first axis.
+
+    At reset the first value fills the whole history, and past actions are zero.
+
+    :param env: with a Dict observation
+    :param length: values kept, the current one included
+    :param actions: whether to append the ``length - 1`` actions between them (Box actions, one-dimensional entry)
+    :param key: the entry that gets a history
+    :raises ValueError: if ``length`` is not positive, or the entry or the actions are of another kind
+    """
+
+    def __init__(self, env: gym.Env, length: int, actions: bool = False, key: str = PARTIAL):
+        super().__init__(env, key)
+        if length < 1:
+            raise ValueError(f"length must be at least 1, got {length}.")
+        if not self._entry.shape:
+            raise ValueError(f'History needs an entry with at least one axis, but "{key}" has {self._entry}.')
+        if actions and not (isinstance(env.action_space, spaces.Box) and len(self._entry.shape) == 1):
+            raise ValueError(
+                f'actions=True needs Box actions and a one-dimensional entry "{key}", but the environment has '
+                f"{env.action_space} and {self._entry}."
+            )
+        n_actions = int(np.prod(env.action_space.shape)) if actions else 0  # type: ignore[arg-type]
+        self._no_action = np.zeros(n_actions, dtype=np.float32)
+        self._values: deque[np.ndarray] = deque(maxlen=length)
+        self._actions: deque[np.ndarray] = deque(maxlen=length - 1)
+        boxes = [self._entry] * length
+        if actions:
+            # A policy may hand in actions outside the space, which many environments clip
+            boxes += [spaces.Box(-np.inf, np.inf, (n_actions,), np.float32)] * (length - 1)
+        self._set_entry_space(concatenate_boxes(boxes))
+
+    def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
+        self._values.extend([value] * (self._values.maxlen or 0))
+        self._actions.extend([self._no_action] * (self._actions.maxlen or 0))
+        return self._joined()
+
+    def _next(self, value: np.ndarray, action: Any) -> np.ndarray:
+        self._values.append(value)
+        if self._no_action.size:
+            self._actions.append(np.array(action, dtype=np.float32).ravel())
+        return self._joined()
+
+    def _joined(self) -> np.ndarray:
+        parts = [*self._values, *self._actions] if self._no_action.size else list(self._values)
+        return np.concatenate(parts, dtype=self._entry.dtype)
+
+
+def _check_indices(name: str, indices: Sequence[int], space: spaces.Box) -> np.ndarray:
+    array = np.asarray(list(indices), dtype=np.int64)
+    size = int(np.prod(space.shape))
+    if array.size == 0 or array.min() < 0 or array.max() >= size:
+        raise ValueError(f"{name} must be a non-empty list of indices in 0..{size - 1}, got {list(indices)}.")
+    return array
+
+
+def _check_keys(name: str, selection: KeySelection, space: spaces.Dict) -> dict[str, Any]:
+    """Key -> index array, or a slice for the whole entry."""
+    if isinstance(selection, str) or not selection:
+        raise ValueError(f"{name} must be a non-empty list of keys, or a mapping from keys to indices, got {selection!r}.")
+    by_key: Mapping[str, Sequence[int] | None] = selection if isinstance(selection, Mapping) else dict.fromkeys(selection)
+    resolved: dict[str, Any] = {}
+    for key, indices in by_key.items():
+        entry = box_entry(space, key)
+        resolved[key] = slice(None) if indices is None else _check_indices(f'{name}["{key}"]', indices, entry)
+    return resolved

@@ -1,0 +1,1 @@
+"""Guided Actor-Critic, its policies, ablations and presets."""

@@ -1,0 +1,24 @@
+"""The paper's ablations of the learner's objective (its Figure 6)."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.common.losses import distillation_loss
+from sb3_gac.gac.gac import GAC
+
+
+class GACShare(GAC):
+    """GAC_share: the learner climbs the guided critics (eq. 16 with Q_theta); it has none of its own."""
+
+    def _policy_options(self) -> dict[str, Any]:
+        return super()._policy_options() | {"learner_critics": False}
+
+
+class GACWithoutQ(GACShare):
+    """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14)."""
+
+    def _learner_loss(self, obs: PyTorchObs, learner: TanhGaussian, kl: th.Tensor) -> th.Tensor:
+        return distillation_loss(kl)
