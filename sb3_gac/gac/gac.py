@@ -197,7 +197,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         """Eqs. 12 and 15, all critics in one backward pass."""
         losses, metrics = [], {}
         targets = self._critic_targets(batch)
-        for name, (critic, _), target in zip(("guider", "learner"), self.policy.critic_pairs, targets, strict=True):
+        for name, (critic, _), target in zip(("guider", "learner"), self.policy.critic_pairs, targets, strict=False):
             q = critic(batch.observations, batch.actions)
             losses.append(critic_loss(q, target))
             metrics[f"{name}_critic_loss"] = losses[-1].detach()

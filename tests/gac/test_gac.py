@@ -1,0 +1,263 @@
+"""GAC's gradient step against an independent computation, what it learns, what it logs, and what it refuses."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_gac import GAC, GACShare, GACWithoutQ, preset
+from tests.helpers import TwoViewBandit, small_model
+
+LOGGED = {
+    *("kl", "kl_p95", "kl_above_target", "target_kl", "kl_coef", "kl_coef_loss", "kl_coef_on_bound"),
+    *("entropy", "ent_coef", "ent_coef_loss", "actor_loss", "guider_loss", "critic_loss", "log_std_loss"),
+    *("guider_critic_loss", "learner_critic_loss", "guider_q_mean", "learner_q_mean", "learning_rate", "n_updates"),
+    *("guider_grad_norm", "learner_grad_norm", "guider_critic_grad_norm", "learner_critic_grad_norm"),
+}
+
+
+def _numpy_state(policy):
+    return {name: p.detach().double().numpy() for name, p in policy.named_parameters()}
+
+
+def _mlp(x, weights, prefix, heads):
+    """One SiLU hidden layer and linear heads, in numpy."""
+    hidden = x @ weights[f"{prefix}.latent_net.0.weight"].T + weights[f"{prefix}.latent_net.0.bias"]
+    hidden = hidden / (1 + np.exp(-hidden))
+    return [hidden @ weights[f"{prefix}.{head}.weight"].T + weights[f"{prefix}.{head}.bias"] for head in heads]
+
+
+def _ensemble(x, weights, prefix):
+    """Twin critics with one SiLU hidden layer, in numpy; shape (2, B)."""
+    values = []
+    for i in range(2):
+        hidden = x @ weights[f"{prefix}.q_networks.0.weight"][i] + weights[f"{prefix}.q_networks.0.bias"][i]
+        hidden = hidden / (1 + np.exp(-hidden))
+        values.append((hidden @ weights[f"{prefix}.q_networks.2.weight"][i] + weights[f"{prefix}.q_networks.2.bias"][i])[:, 0])
+    return np.stack(values)
+
+
+@pytest.mark.parametrize("guider", ["residual", "independent"])
+def test_critic_targets_match_an_independent_computation(guider):
+    """Eqs. 12 and 15 from the raw weights, in numpy and float64, with the sampling noise replayed."""
+    model = small_model(guider=guider, kl_coef=0.7, ent_coef=0.2, learning_starts=1000)
+    model.learn(64)
+    with th.no_grad():  # a guider that differs from its learner
+        model.policy.guider.mean.bias.add_(0.3)
+    batch = model._sample_batch(32)
+    th.manual_seed(5)
+    guided, of_learner = (target.double().numpy() for target in model._critic_targets(batch))
+
+    th.manual_seed(5)
+    guider_noise, learner_noise = (th.randn(32, 1).double().numpy() for _ in range(2))
+    weights = _numpy_state(model.policy)
+    o, s = (batch.next_observations[key].double().numpy() for key in ("partial", "privileged"))
+    full = np.concatenate([o, s], axis=1)
+    (learner_mean,) = _mlp(o, weights, "learner", ["mean"])
+    output, log_std = _mlp(full, weights, "guider", ["mean", "log_std"])
+    std = np.exp(log_std)
+    guider_mean = learner_mean + std * output if guider == "residual" else output
+    kl = (((guider_mean - learner_mean) / std) ** 2 / 2).mean(axis=1)
+    pre_tanh = guider_mean + std * guider_noise
+    action = np.tanh(pre_tanh)
+    log_prob = -((guider_noise[:, 0]) ** 2) / 2 - log_std[:, 0] - np.log(2 * np.pi) / 2 - np.log(1 - action[:, 0] ** 2)
+    q = _ensemble(np.concatenate([full, action], axis=1), weights, "guider_critic_target").min(axis=0)
+    reward, done = batch.rewards.double().numpy(), batch.dones.double().numpy()
+    np.testing.assert_allclose(guided, reward + 0.99 * (1 - done) * (q - 0.7 * kl - 0.2 * log_prob), rtol=1e-4, atol=1e-5)
+    action = np.tanh(learner_mean + std * learner_noise)
+    q = _ensemble(np.concatenate([full, action], axis=1), weights, "learner_critic_target").min(axis=0)
+    np.testing.assert_allclose(of_learner, reward + 0.99 * (1 - done) * q, rtol=1e-4, atol=1e-5)
+
+
+def test_residual_guider_starts_at_the_learner_and_its_kl_is_half_its_squared_output():
+    model = small_model()
+    obs = {"partial": th.randn(64, 2), "privileged": th.randn(64, 1)}
+    guider, learner, _ = model.policy.distributions(obs)
+    delta = model.policy.guider.mean(model.policy.guider.latent(obs))
+    th.testing.assert_close(model._kl(guider.mean, learner), 0.5 * delta.square().mean(-1), rtol=1e-3, atol=1e-6)
+    assert model._kl(guider.mean, learner).mean() < 1e-3
+
+
+@pytest.mark.parametrize("guider", ["residual", "independent"])
+@pytest.mark.parametrize("kl_reduction", ["mean", "sum"])
+def test_max_kl_bounds_the_kl_of_every_state(guider, kl_reduction):
+    model = small_model(guider=guider, max_kl=0.01, kl_reduction=kl_reduction)
+    with th.no_grad():
+        model.policy.guider.mean.weight.mul_(1000)
+    obs = {"partial": 10 * th.randn(64, 2), "privileged": 10 * th.randn(64, 1)}
+    distributions = model.policy.distributions(obs)
+    kl = model._kl(distributions[0].mean, distributions[1])
+    assert kl.max() <= 0.01 * 1.001
+    assert kl.max() > 0.009, "the bound was never met, so nothing was tested"
+
+
+def test_the_guider_collects_and_the_learner_is_evaluated():
+    model = small_model()
+    with th.no_grad():
+        model.policy.guider.mean.bias.fill_(50.0)
+    obs = TwoViewBandit().reset(seed=0)[0]
+    assert model.predict_guider(obs, deterministic=True)[0][0] == pytest.approx(1.0)
+    assert model.predict(obs, deterministic=True)[0][0] < 0.9
+    model.num_timesteps = 10_000  # past the warm-up
+    model._last_obs = {key: value[None] for key, value in obs.items()}
+    action, scaled = model._sample_action(learning_starts=10)
+    assert action.shape == scaled.shape == (1, 1)
+    assert scaled[0, 0] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_everything_is_logged():
+    model = small_model()
+    model.learn(30)
+    logged = {name.removeprefix("train/") for name in model.logger.name_to_value if name.startswith("train/")}
+    assert logged >= LOGGED
+    values = [value for name, value in model.logger.name_to_value.items() if name.startswith("train/")]
+    assert np.isfinite(values).all()
+
+
+def test_logged_values_are_means_over_the_gradient_steps():
+    model = small_model(kl_coef=0.5)
+    model.learn(30)
+    history = []
+    original = model._gradient_step
+    model._gradient_step = lambda batch: history.append(original(batch)) or history[-1]
+    model.train(gradient_steps=5, batch_size=8)
+    expected = np.mean([step["critic_loss"].item() for step in history])
+    assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(expected, rel=1e-5)
+    assert model.logger.name_to_value["train/kl_coef"] == 0.5
+
+
+def test_targets_follow_at_their_interval():
+    model = small_model(target_update_interval=3, learning_starts=1000)
+    model.learn(30)
+    updates = []
+    model.policy.update_targets = updates.append
+    for _ in range(7):
+        model.train(gradient_steps=1, batch_size=8)
+    model.train(gradient_steps=2, batch_size=8)
+    assert updates == [model.tau] * 3, "counted over all gradient steps, not over those of one train()"
+
+
+def test_target_kl_may_shrink_over_training():
+    model = small_model(target_kl=LinearSchedule(0.02, 0.002, 0.5))
+    model.learn(100)
+    assert model.current_target_kl == pytest.approx(0.002)
+    model._current_progress_remaining = 0.75
+    assert model.current_target_kl == pytest.approx(0.011)
+
+
+@pytest.mark.parametrize(
+    ("cls", "arguments", "tolerance"),
+    [
+        (GAC, {}, 0.05),
+        (GAC, {"guider": "independent", "max_kl": 0.02}, 0.05),
+        (GACShare, {}, 0.05),
+        (GACWithoutQ, {"target_kl": 0.1}, 0.08),
+    ],
+    ids=["GAC", "independent", "GACShare", "GACWithoutQ"],
+)
+def test_learner_reaches_the_known_optimum(cls, arguments, tolerance):
+    """The target is in the partial view; random actions are 0.6 away from it on average."""
+    model = small_model(TwoViewBandit(), cls, learning_rate=3e-3, batch_size=64, learning_starts=200, **arguments)
+    model.learn(1500)
+    targets = np.linspace(-0.7, 0.7, 15, dtype=np.float32)
+    partial = np.stack([targets, np.zeros_like(targets)], axis=1)
+    actions, _ = model.predict({"partial": partial}, deterministic=True)
+    assert np.abs(actions[:, 0] - targets).mean() < tolerance
+
+
+def test_learner_averages_over_what_it_cannot_see():
+    """Through noise the best action is the posterior mean, well inside the target's range; the guider sees the target."""
+    model = small_model(TwoViewBandit(noise_std=0.5), learning_rate=3e-3, batch_size=64, learning_starts=200)
+    model.learn(2500)
+    noise, targets = np.linspace(-1.2, 1.2, 9), np.linspace(-0.8, 0.8, 2001)
+    likelihood = np.exp(-0.5 * ((noise[:, None] - targets) / 0.5) ** 2)
+    posterior_mean = (likelihood * targets).sum(axis=1) / likelihood.sum(axis=1)
+    partial = np.stack([noise, np.zeros(9)], axis=1).astype(np.float32)
+    actions, _ = model.predict({"partial": partial}, deterministic=True)
+    assert np.abs(actions[:, 0] - posterior_mean).mean() < 0.1
+    assert np.abs(actions[:, 0] - noise).mean() > 0.2, "following the noise would be something else"
+
+
+def test_kl_settles_at_its_target():
+    model = small_model(TwoViewBandit(noise_std=0.5), learning_rate=1e-3, batch_size=64, learning_starts=100, target_kl=0.02)
+    kls = []
+    original = model._gradient_step
+
+    def spy(batch):
+        metrics = original(batch)
+        kls.append(metrics["kl"].item())
+        return metrics
+
+    model._gradient_step = spy
+    model.learn(2500)
+    assert np.mean(kls[-500:]) == pytest.approx(0.02, rel=0.25)
+
+
+@pytest.mark.parametrize("truncate", [True, False])
+def test_time_limits_bootstrap_and_terminations_do_not(truncate):
+    """An episode of one step with reward 1 is worth 1 if it terminates, and 1 / (1 - gamma) if only time ran out."""
+
+    class OneStep(gym.Env):
+        observation_space = spaces.Dict(partial=spaces.Box(-1, 1, (1,)), privileged=spaces.Box(-1, 1, (1,)))
+        action_space = spaces.Box(-1, 1, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return {key: np.zeros(1, dtype=np.float32) for key in ("partial", "privileged")}, {}
+
+        def step(self, action):
+            return self.reset()[0], 1.0, not truncate, truncate, {}
+
+    model = small_model(OneStep(), gamma=0.8, tau=0.1, ent_coef=0.0, kl_coef=0.0, learning_rate=3e-3, batch_size=32)
+    model.learn(1200)
+    obs = {key: th.zeros(1, 1) for key in ("partial", "privileged")}
+    expected = 5.0 if truncate else 1.0
+    for critic in (model.policy.guider_critic, model.policy.learner_critic):
+        assert critic(obs, th.zeros(1, 1)).detach().numpy() == pytest.approx(expected, rel=0.1)
+
+
+def test_ablations_have_the_critics_that_they_should():
+    assert small_model(cls=GACShare).policy.learner_critic is None
+    share = small_model(cls=GACShare)
+    assert share.policy.critic is share.policy.guider_critic
+    full = small_model()
+    assert full.policy.critic is full.policy.learner_critic
+    assert full.critic_target is full.policy.learner_critic_target
+
+
+def test_without_q_the_learner_imitates_and_nothing_else():
+    model = small_model(cls=GACWithoutQ)
+    kl = th.tensor([0.2, 0.4])
+    assert model._learner_loss({}, None, kl).item() == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("name", ["small", "paper"])
+def test_presets_train(name):
+    arguments = preset(name, learning_starts=20, batch_size=8, gradient_steps=1, buffer_size=100)
+    model = GAC("MultiInputPolicy", TwoViewBandit(), **arguments)
+    model.learn(30)
+    assert model._n_updates > 0
+
+
+def test_preset_paper_is_the_papers_table():
+    model = GAC("MultiInputPolicy", TwoViewBandit(), **preset("paper", buffer_size=1000))
+    assert (model.guider, model.batch_size, model.gradient_steps) == ("independent", 512, 64)
+    assert (model.gamma, model.tau, model.learning_rate, model.max_grad_norm) == (0.99, 0.005, 3e-4, 1.0)
+    assert model.target_entropy == -0.5
+    assert model.policy.learner.net_arch == [256, 256]
+
+
+def test_preset_merges_policy_kwargs_and_leaves_the_table_alone():
+    arguments = preset("small", policy_kwargs={"n_critics": 3})
+    assert arguments["policy_kwargs"] == {"net_arch": [128, 128], "n_critics": 3}
+    assert "n_critics" not in preset("small")["policy_kwargs"]
+    with pytest.raises(ValueError, match="preset must be one of"):
+        preset("large")
+
+
+def test_target_entropy_conventions():
+    assert small_model().target_entropy == -0.5
+    assert small_model(target_entropy="sac").target_entropy == -1.0
+    assert small_model(target_entropy=-2).target_entropy == -2.0

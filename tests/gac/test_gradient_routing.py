@@ -1,0 +1,148 @@
+"""Which loss moves which network: exactly those that it should, for every loss and every variant."""
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_gac import GAC, GACShare, GACWithoutQ
+from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.common.losses import critic_loss, distillation_loss, guider_loss, learner_loss, log_std_loss
+from tests.helpers import small_model
+
+
+def _observations(n=8):
+    generator = th.Generator().manual_seed(0)
+    return {"partial": th.randn(n, 2, generator=generator), "privileged": th.randn(n, 1, generator=generator)}
+
+
+def _reached(policy, loss):
+    """Names of the policy's parts in which the loss leaves a gradient."""
+    for parameter in policy.parameters():
+        parameter.grad = None
+    loss.backward()
+    touched = {name for name, p in policy.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
+    parts = {name.split(".")[0] for name in touched}
+    if "learner" in parts:  # the learner's deployment log-std head is a part of its own
+        of_learner = {name.removeprefix("learner.") for name in touched if name.startswith("learner.")}
+        parts -= {"learner"}
+        parts |= {"learner_log_std" if name.startswith("log_std.") else "learner" for name in of_learner}
+    return parts
+
+
+@pytest.fixture(params=["residual", "independent"])
+def model(request):
+    return small_model(guider=request.param)
+
+
+def test_guider_loss_moves_the_guider_alone(model):
+    obs = _observations()
+    guider, learner, _ = model.policy.distributions(obs)
+    kl = model._kl(guider.mean, TanhGaussian(learner.mean.detach(), learner.log_std))
+    log_prob = guider.sample_with_log_prob()[1]
+    assert _reached(model.policy, guider_loss(kl, log_prob, th.zeros(2, 8), 1.0, 0.1)) == {"guider"}
+
+
+def test_learner_kl_moves_the_learner_alone_and_not_its_log_std_head(model):
+    guider, learner, _ = model.policy.distributions(_observations())
+    kl = model._kl(guider.mean.detach() + 0.1, learner)
+    assert _reached(model.policy, distillation_loss(kl)) == {"learner"}
+
+
+def test_learner_q_term_has_a_gradient_for_the_mean_but_not_for_the_borrowed_std(model):
+    obs = _observations()
+    _, learner, _ = model.policy.distributions(obs)
+    q = model.policy.learner_critic(obs, learner.sample())
+    assert _reached(model.policy, learner_loss(th.zeros(8), q, 1.0)) == {"learner", "learner_critic"}
+
+
+def test_log_std_loss_moves_its_head_alone(model):
+    guider, _, deployment_log_std = model.policy.distributions(_observations())
+    loss = log_std_loss(deployment_log_std, guider.log_std.detach() + 1)
+    assert _reached(model.policy, loss) == {"learner_log_std"}
+
+
+@pytest.mark.parametrize("part", ["guider_critic", "learner_critic"])
+def test_each_critic_loss_moves_its_own_critics(model, part):
+    q = getattr(model.policy, part)(_observations(), th.zeros(8, 1))
+    assert _reached(model.policy, critic_loss(q, th.ones(8))) == {part}
+
+
+def test_kl_does_not_move_the_std(model):
+    guider, learner, _ = model.policy.distributions(_observations())
+    kl = model._kl(guider.mean + 0.1, TanhGaussian(learner.mean.detach(), learner.log_std))
+    for parameter in model.policy.parameters():
+        parameter.grad = None
+    kl.sum().backward()
+    assert model.policy.guider.log_std.weight.grad is None
+    assert model.policy.guider.mean.weight.grad is not None
+
+
+def _changed_parts(model, update):
+    before = {name: p.detach().clone() for name, p in model.policy.named_parameters()}
+    update()
+    changed = {n for n, p in model.policy.named_parameters() if not th.equal(p, before[n])}
+    return {name.split(".")[0] for name in changed}
+
+
+def _filled(cls, **arguments):
+    model = small_model(cls=cls, learning_starts=1000, **arguments)
+    model.learn(64)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("cls", "critics"),
+    [(GAC, {"guider_critic", "learner_critic"}), (GACShare, {"guider_critic"}), (GACWithoutQ, {"guider_critic"})],
+)
+def test_updates_leave_the_other_networks_bit_for_bit(cls, critics):
+    model = _filled(cls)
+    batch = model._sample_batch(32)
+    assert _changed_parts(model, lambda: model._update_critics(batch)) == critics
+    assert _changed_parts(model, lambda: model._update_policies(batch.observations)) == {"guider", "learner"}
+    targets = {f"{name}_target" for name in critics}
+    assert _changed_parts(model, lambda: model.policy.update_targets(0.5)) == targets
+
+
+def test_policy_update_leaves_no_gradient_in_the_critics():
+    model = _filled(GAC)
+    batch = model._sample_batch(32)
+    model.policy.critic_optimizer.zero_grad()
+    model._update_policies(batch.observations)
+    assert all(p.grad is None for critic, _ in model.policy.critic_pairs for p in critic.parameters())
+
+
+def test_learner_has_no_gradient_with_respect_to_privileged():
+    model = small_model()
+    obs = _observations()
+    obs["privileged"].requires_grad_(True)
+    obs["partial"].requires_grad_(True)
+    mean, log_std = model.policy.learner(obs)
+    (mean.sum() + log_std.sum()).backward()
+    assert obs["privileged"].grad is None
+    assert obs["partial"].grad.abs().sum() > 0
+
+
+def test_learner_action_ignores_privileged_whatever_it_holds():
+    model = small_model()
+    partial = np.random.default_rng(0).standard_normal((5, 2)).astype(np.float32)
+    alone, _ = model.predict({"partial": partial}, deterministic=True)
+    for privileged in (np.zeros((5, 1)), np.full((5, 1), 1e6), np.full((5, 1), np.nan)):
+        full, _ = model.predict({"partial": partial, "privileged": privileged.astype(np.float32)}, deterministic=True)
+        np.testing.assert_array_equal(alone, full)
+
+
+def test_guider_does_depend_on_privileged():
+    model = small_model()
+    obs = _observations()
+    obs["privileged"].requires_grad_(True)
+    model.policy.distributions(obs)[0].mean.sum().backward()
+    assert obs["privileged"].grad.abs().sum() > 0
+
+
+def test_the_log_std_head_has_no_say_in_the_clipping_of_the_learner():
+    """Its gradient belongs to another loss: a huge one must not shrink the learner's."""
+    model = _filled(GAC, max_grad_norm=1.0)
+    head = {id(p) for p in model.policy.learner.log_std.parameters()}
+    names = {name for name, p in model.policy.learner.named_parameters() if id(p) in head}
+    assert names == {"log_std.weight", "log_std.bias"}
+    assert head.isdisjoint(id(p) for p in model.policy.learner.mean_parameters())

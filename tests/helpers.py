@@ -1,0 +1,57 @@
+"""Small environments and models for the tests."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_gac import GAC
+
+
+class TwoViewBandit(gym.Env):
+    """
+    One-step task with a known optimum: the target is seen exactly in ``privileged`` and through noise in ``partial``.
+
+    Return of action a for target z: -(a - z)^2.  With z ~ U(-0.8, 0.8) and partial = z + N(0, noise_std), the best that
+    a learner can do is the posterior mean of z.
+
+    :param noise_std: of the partial view
+    :param length: steps per episode; each draws a new target
+    """
+
+    def __init__(self, noise_std: float = 0.0, length: int = 1):
+        self.observation_space = spaces.Dict(
+            partial=spaces.Box(-np.inf, np.inf, (2,), np.float32), privileged=spaces.Box(-1, 1, (1,), np.float32)
+        )
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32)
+        self.noise_std, self.length = noise_std, length
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
+        super().reset(seed=seed)
+        self._step = 0
+        return self._draw(), {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict]:
+        reward = -float((action[0] - self._target) ** 2)
+        self._step += 1
+        return self._draw(), reward, self._step >= self.length, False, {}
+
+    def _draw(self) -> dict[str, np.ndarray]:
+        self._target = self.np_random.uniform(-0.8, 0.8)
+        seen = self._target + self.noise_std * self.np_random.standard_normal()
+        partial = np.array([seen, self.np_random.standard_normal()], dtype=np.float32)
+        return {"partial": partial, "privileged": np.array([self._target], dtype=np.float32)}
+
+
+def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
+    """A model whose gradient steps take a few milliseconds."""
+    defaults = {
+        "learning_starts": 10,
+        "batch_size": 16,
+        "buffer_size": 1000,
+        "seed": 0,
+        "device": "cpu",
+        "policy_kwargs": {"net_arch": [16]},
+    }
+    return cls("MultiInputPolicy", TwoViewBandit() if env is None else env, **{**defaults, **arguments})
