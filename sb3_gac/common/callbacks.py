@@ -107,7 +107,7 @@ class GuiderLearnerEvalCallback(EvalCallback):
         found = {
             "kl": (
                 kl > 2 * target_kl,
-                f"KL(guider || learner) is {kl:.2g}, {kl / target_kl:.1f} times its target: the learner does not keep up. "
+                f"KL(guider || learner) is {kl:.2g} for a target of {target_kl:.2g}: the learner does not keep up. "
                 'Use guider="residual", set a hard bound with max_kl, or raise target_kl.',
             ),
             "bound": (

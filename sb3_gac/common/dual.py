@@ -56,14 +56,13 @@ class DualVariable:
         :return: "loss", and "on_bound": 1 if the coefficient sits on one of its bounds, else 0
         """
         assert self.optimizer is not None
-        loss = dual_loss(self.log_value, violation)
-        self.optimizer.zero_grad()
-        loss.backward()
-        self.optimizer.step()
         with th.no_grad():
+            loss = dual_loss(self.log_value, violation)
+            self.log_value.grad = loss.view(1)  # d/dx (-exp(x) v) = -exp(x) v: the gradient is the loss itself
+            self.optimizer.step()
             self.log_value.clamp_(*self._log_bounds)
             on_bound = (self.log_value <= self._log_bounds[0]) | (self.log_value >= self._log_bounds[1])
-        return {"loss": loss.detach(), "on_bound": on_bound.float().mean()}
+        return {"loss": loss, "on_bound": on_bound.float().mean()}
 
 
 Coefficient = FixedCoefficient | DualVariable

@@ -1,5 +1,6 @@
 """Building blocks of the policies: an ensemble of Q-networks evaluated at once."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch as th
@@ -9,6 +10,23 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
+
+
+def trainable(parameters: Iterable[nn.Parameter]) -> list[nn.Parameter]:
+    """Those that an optimiser may change: parts of an encoder may be frozen."""
+    return [parameter for parameter in parameters if parameter.requires_grad]
+
+
+def polyak_average(parameters: list[th.Tensor], targets: list[th.Tensor], tau: float) -> None:
+    """
+    target <- tau parameter + (1 - tau) target, in place, one call for all.
+
+    :param parameters: of the network
+    :param targets: of its target, in the same order
+    :param tau: in [0, 1]
+    """
+    with th.no_grad():
+        th._foreach_lerp_(targets, parameters, tau)
 
 
 class RoleModel(BaseModel):

@@ -1,7 +1,6 @@
 """What off-policy algorithms with a privileged view share: acting, the train loop, logging, checks and save lists."""
 
 from abc import abstractmethod
-from collections.abc import Iterable
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -48,7 +47,7 @@ class Batch(NamedTuple):
     discounts: th.Tensor | float
 
 
-def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float | None) -> th.Tensor:
+def clip_gradients(parameters: list[th.nn.Parameter], max_norm: float | None) -> th.Tensor:
     """
     Scale gradients in place to a norm of at most ``max_norm``, without waiting for the device.
 

@@ -75,13 +75,16 @@ def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", **
     :param task: a key of ``TASKS``
     :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
-    :param kwargs: of the gymnasium environment
-    :raises ValueError: if the task or ``privileged`` is unknown, or ``noise_std`` negative
+    :param kwargs: of the gymnasium environment, but for those that change its observation
+    :raises ValueError: if the task or ``privileged`` is unknown, ``noise_std`` negative, or ``kwargs`` change the layout
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
     if privileged not in PRIVILEGED_CHOICES:
         raise ValueError(f"privileged must be one of {list(PRIVILEGED_CHOICES)}, got {privileged!r}.")
+    misplacing = sorted(name for name in kwargs if name.endswith("_observation"))
+    if misplacing:
+        raise ValueError(f"{misplacing} would change the observation, of which the split is made by position.")
     layout = TASKS[task]
     env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs})
     visible = layout.velocity if privileged == "velocity" else tuple(sorted((*layout.partial, *layout.velocity)))

@@ -22,7 +22,26 @@ Observation = dict[str, np.ndarray]
 _NOISE_STREAM = 0x6E6F697365  # keeps the noise apart from generators that others seed with the same number
 
 
-class SplitObservation(gym.ObservationWrapper):
+def _reset(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
+    """Reset with those keywords that were given: not every environment knows both."""
+    given = {name: value for name, value in {"seed": seed, "options": options}.items() if value is not None}
+    return env.reset(**given)
+
+
+class _SplitWrapper(gym.ObservationWrapper):
+    """Base of wrappers that make ``partial`` and ``privileged``."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """
+        :param seed: of the environment
+        :param options: of the environment
+        :return: ``partial`` and ``privileged``, info
+        """
+        observation, info = _reset(self.env, seed, options)
+        return self.observation(observation), info
+
+
+class SplitObservation(_SplitWrapper):
     """
     Split a flat Box observation by indices.
 
@@ -52,7 +71,7 @@ class SplitObservation(gym.ObservationWrapper):
         return {key: observation[index].astype(np.float32) for key, index in self._indices.items()}
 
 
-class SplitDictObservation(gym.ObservationWrapper):
+class SplitDictObservation(_SplitWrapper):
     """
     Split a Dict observation, such as that of a goal environment, by keys; entries are flattened and concatenated.
 
@@ -108,8 +127,7 @@ class _EntryWrapper(gym.Wrapper):
         :param options: of the environment
         :return: changed observation, info
         """
-        given = {name: value for name, value in {"seed": seed, "options": options}.items() if value is not None}
-        observation, info = self.env.reset(**given)  # not every environment knows both keywords
+        observation, info = _reset(self.env, seed, options)
         return {**observation, self._key: self._first(observation[self._key], seed)}, info
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
@@ -140,7 +158,7 @@ class SensorNoise(_EntryWrapper):
     :param env: with a Dict observation
     :param noise_std: standard deviation, in the units of the entry: a number, or one per component
     :param key: the entry that becomes noisy
-    :raises ValueError: if ``noise_std`` is negative, or the entry is missing or of integers
+    :raises ValueError: if ``noise_std`` is negative or of another shape, or the entry is missing or of integers
     """
 
     def __init__(self, env: gym.Env, noise_std: float | Sequence[float], key: str = PARTIAL):
@@ -150,15 +168,18 @@ class SensorNoise(_EntryWrapper):
             raise ValueError(f"noise_std must be a finite number >= 0, or one per component, got {noise_std!r}.")
         if not np.issubdtype(self._entry.dtype, np.floating):  # type: ignore[arg-type]
             raise ValueError(f'SensorNoise needs a floating-point entry, but "{key}" has {self._entry}.')
+        if self.noise_std.shape not in ((), self._entry.shape):
+            raise ValueError(f"noise_std must be a number or have the entry's shape {self._entry.shape}, got {noise_std!r}.")
         noisy = np.broadcast_to(self.noise_std, self._entry.shape) > 0
         low, high = np.where(noisy, -np.inf, self._entry.low), np.where(noisy, np.inf, self._entry.high)
         dtype = self._entry.dtype
         self._set_entry_space(spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype))  # type: ignore[arg-type]
+        self._stream = [_NOISE_STREAM] * (1 + _count_wrappers(env, SensorNoise))  # apart from noise further in
         self._generator = np.random.default_rng()
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         if seed is not None:
-            self._generator = np.random.default_rng([seed, _NOISE_STREAM])
+            self._generator = np.random.default_rng([seed, *self._stream])
         return self._noisy(value)
 
     def _next(self, value: np.ndarray, action: Any) -> np.ndarray:
@@ -177,7 +198,7 @@ class History(_EntryWrapper):
 
     :param env: with a Dict observation
     :param length: values kept, the current one included
-    :param actions: whether to append the ``length - 1`` actions between them (Box actions, one-dimensional entry)
+    :param actions: whether to append the ``length - 1`` actions between them (Box actions, one-dimensional float entry)
     :param key: the entry that gets a history
     :raises ValueError: if ``length`` is not positive, or the entry or the actions are of another kind
     """
@@ -188,10 +209,11 @@ class History(_EntryWrapper):
             raise ValueError(f"length must be at least 1, got {length}.")
         if not self._entry.shape:
             raise ValueError(f'History needs an entry with at least one axis, but "{key}" has {self._entry}.')
-        if actions and not (isinstance(env.action_space, spaces.Box) and len(self._entry.shape) == 1):
+        is_vector = len(self._entry.shape) == 1 and np.issubdtype(self._entry.dtype, np.floating)  # type: ignore[arg-type]
+        if actions and not (isinstance(env.action_space, spaces.Box) and is_vector):
             raise ValueError(
-                f'actions=True needs Box actions and a one-dimensional entry "{key}", but the environment has '
-                f"{env.action_space} and {self._entry}."
+                f'actions=True needs Box actions and a one-dimensional, floating-point entry "{key}", but the environment '
+                f"has {env.action_space} and {self._entry}."
             )
         n_actions = int(np.prod(env.action_space.shape)) if actions else 0  # type: ignore[arg-type]
         self._no_action = np.zeros(n_actions, dtype=np.float32)
@@ -204,12 +226,12 @@ class History(_EntryWrapper):
         self._set_entry_space(concatenate_boxes(boxes))
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
-        self._values.extend([value] * (self._values.maxlen or 0))
+        self._values.extend([value.copy()] * (self._values.maxlen or 0))
         self._actions.extend([self._no_action] * (self._actions.maxlen or 0))
         return self._joined()
 
     def _next(self, value: np.ndarray, action: Any) -> np.ndarray:
-        self._values.append(value)
+        self._values.append(value.copy())  # the environment may write into it again
         if self._no_action.size:
             self._actions.append(np.array(action, dtype=np.float32).ravel())
         return self._joined()
@@ -219,10 +241,19 @@ class History(_EntryWrapper):
         return np.concatenate(parts, dtype=self._entry.dtype)
 
 
+def _count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
+    count = 0
+    while isinstance(env, gym.Wrapper):
+        count += isinstance(env, kind)
+        env = env.env
+    return count
+
+
 def _check_indices(name: str, indices: Sequence[int], space: spaces.Box) -> np.ndarray:
-    array = np.asarray(list(indices), dtype=np.int64)
+    array = np.asarray(list(indices))
     size = int(np.prod(space.shape))
-    if array.size == 0 or array.min() < 0 or array.max() >= size:
+    is_list = array.ndim == 1 and array.size > 0 and np.issubdtype(array.dtype, np.integer)
+    if not is_list or array.min() < 0 or array.max() >= size:
         raise ValueError(f"{name} must be a non-empty list of indices in 0..{size - 1}, got {list(indices)}.")
     return array
 

@@ -1,5 +1,6 @@
 """Guided Actor-Critic."""
 
+import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -197,33 +198,34 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         """Eqs. 12 and 15, all critics in one backward pass."""
         losses, metrics = [], {}
         targets = self._critic_targets(batch)
-        for name, (critic, _), target in zip(("guider", "learner"), self.policy.critic_pairs, targets, strict=False):
-            q = critic(batch.observations, batch.actions)
+        for name, target in targets.items():
+            q = getattr(self.policy, name)(batch.observations, batch.actions)
             losses.append(critic_loss(q, target))
-            metrics[f"{name}_critic_loss"] = losses[-1].detach()
-            metrics[f"{name}_q_mean"] = q.detach().mean()
+            metrics |= {f"{name}_loss": losses[-1].detach(), f"{name}_q": q.detach().mean()}
         loss = th.stack(losses).sum()
         self.policy.critic_optimizer.zero_grad()
         loss.backward()
-        for name, (critic, _) in zip(("guider", "learner"), self.policy.critic_pairs, strict=False):
-            metrics[f"{name}_critic_grad_norm"] = clip_gradients(critic.parameters(), self.max_grad_norm)
+        for name in targets:
+            metrics[f"{name}_grad_norm"] = self._clip_gradients(name)
         self.policy.critic_optimizer.step()
         return metrics | {"critic_loss": loss.detach()}
 
     @th.no_grad()
-    def _critic_targets(self, batch: Batch) -> list[th.Tensor]:
-        """Targets of the critics in :attr:`GACPolicy.critic_pairs`, each of shape (B,)."""
+    def _critic_targets(self, batch: Batch) -> dict[str, th.Tensor]:
+        """Critics -> their targets, each of shape (B,)."""
         guider, learner, _ = self.policy.distributions(batch.next_observations)
         next_action, next_log_prob = guider.sample_with_log_prob()
         next_q = self.policy.guider_critic_target(batch.next_observations, next_action)
         next_kl = self._kl(guider.mean, learner)
         coefficients = (self.kl_coef_dual.value, self.ent_coef_dual.value)
-        targets = [
-            guided_target(batch.rewards, batch.dones, next_q, next_kl, next_log_prob, *coefficients, batch.discounts)
-        ]
+        targets = {
+            "guider_critic": guided_target(
+                batch.rewards, batch.dones, next_q, next_kl, next_log_prob, *coefficients, batch.discounts
+            )
+        }
         if self.policy.learner_critic_target is not None:
             next_q = self.policy.learner_critic_target(batch.next_observations, learner.sample())
-            targets.append(learner_target(batch.rewards, batch.dones, next_q, batch.discounts))
+            targets["learner_critic"] = learner_target(batch.rewards, batch.dones, next_q, batch.discounts)
         return targets
 
     def _update_policies(self, obs: PyTorchObs) -> tuple[Metrics, th.Tensor, th.Tensor]:
@@ -241,10 +243,10 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         deployment_loss = log_std_loss(deployment_log_std, learner.log_std)
         loss = guider_objective + learner_objective + deployment_loss
         self.policy.actor_optimizer.zero_grad()
-        loss.backward(inputs=self.policy.actor_parameters())  # the critics stay as they are
+        loss.backward(inputs=self.policy.actor_parameters)  # the critics stay as they are
         metrics = {
-            "guider_grad_norm": clip_gradients(self.policy.guider.parameters(), self.max_grad_norm),
-            "learner_grad_norm": clip_gradients(self.policy.learner.mean_parameters(), self.max_grad_norm),
+            "guider_grad_norm": self._clip_gradients("guider"),
+            "learner_grad_norm": self._clip_gradients("learner"),
         }
         self.policy.actor_optimizer.step()
         metrics |= {
@@ -271,11 +273,14 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         """KL(guider || learner) with the std that ``learner`` borrowed, shape (B,)."""
         return kl_shared_std(guider_mean, learner.mean, learner.log_std.exp(), self.kl_reduction)
 
+    def _clip_gradients(self, network: str) -> th.Tensor:
+        return clip_gradients(self.policy.network_parameters[network], self.max_grad_norm)
+
     def _policy_diagnostics(self, kl: th.Tensor, log_prob: th.Tensor) -> Metrics:
         target = self.current_target_kl
         return {
             "kl": kl.mean(),
-            "kl_p95": kl.quantile(0.95),
+            "kl_p95": kl.kthvalue(math.ceil(0.95 * kl.numel())).values,
             "kl_above_target": (kl > target).float().mean(),
             "target_kl": kl.new_full((), target),
             "kl_coef": self.kl_coef_dual.value,

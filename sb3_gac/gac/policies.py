@@ -10,11 +10,11 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_gac.common.distributions import TanhGaussian, project_to_kl_ball
-from sb3_gac.common.networks import CriticEnsemble, RoleModel
+from sb3_gac.common.networks import CriticEnsemble, RoleModel, polyak_average, trainable
 from sb3_gac.common.roles import RoleKeys, resolve_net_arch, resolve_role_keys, role_space
 
 DELTA_INIT_SCALE = 0.01
@@ -263,6 +263,7 @@ class GACPolicy(BasePolicy):
         self.role_keys = resolve_role_keys(observation_space, role_keys)
         self._net_arch = resolve_net_arch(net_arch)
         self._build_networks(GUIDERS[guider], max_kl, kl_reduction, learner_critics, log_std_bounds, n_critics)
+        self._collect_parameters()
         self._build_optimizers(lr_schedule)
 
     def _build_networks(
@@ -304,13 +305,31 @@ class GACPolicy(BasePolicy):
         target.set_training_mode(False)
         return critic, target
 
+    def _collect_parameters(self) -> None:
+        """Walking a module tree costs more than the update itself: it is done once."""
+        critics, targets = zip(*self.critic_pairs, strict=True)
+        self._critic_parameters: list[th.Tensor] = [p for critic in critics for p in critic.parameters()]
+        self._target_parameters: list[th.Tensor] = [p for target in targets for p in target.parameters()]
+        self._critic_statistics = [s for critic in critics for s in get_parameters_by_name(critic, ["running_"])]
+        self._target_statistics = [s for target in targets for s in get_parameters_by_name(target, ["running_"])]
+        self.network_parameters: dict[str, list[nn.Parameter]] = {
+            "guider": trainable(self.guider.parameters()),
+            "learner": trainable(self.learner.mean_parameters()),
+            "learner_log_std": trainable(self.learner.log_std.parameters()),
+            "guider_critic": trainable(self.guider_critic.parameters()),
+        }
+        if self.learner_critic is not None:
+            self.network_parameters["learner_critic"] = trainable(self.learner_critic.parameters())
+        names = ("guider", "learner", "learner_log_std")
+        self.actor_parameters = [p for name in names for p in self.network_parameters[name]]
+
     def _build_optimizers(self, lr_schedule: Schedule) -> None:
         """One optimiser for the two policies and one for all critics: their losses never share a parameter."""
         kwargs = dict(self.optimizer_kwargs)
         if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
             kwargs.setdefault("fused", True)
-        critics = [parameter for critic, _ in self.critic_pairs for parameter in critic.parameters()]
-        self.actor_optimizer = self.optimizer_class(self.actor_parameters(), lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+        critics = [p for name, group in self.network_parameters.items() if name.endswith("critic") for p in group]
+        self.actor_optimizer = self.optimizer_class(self.actor_parameters, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
         self.critic_optimizer = self.optimizer_class(critics, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
 
     @property
@@ -335,11 +354,6 @@ class GACPolicy(BasePolicy):
         if self.learner_critic is not None and self.learner_critic_target is not None:
             pairs.append((self.learner_critic, self.learner_critic_target))
         return pairs
-
-    def actor_parameters(self) -> list[nn.Parameter]:
-        """Trainable parameters of guider and learner."""
-        parameters = [*self.guider.parameters(), *self.learner.parameters()]
-        return [parameter for parameter in parameters if parameter.requires_grad]
 
     def distributions(self, obs: PyTorchObs) -> tuple[TanhGaussian, TanhGaussian, th.Tensor]:
         """
@@ -372,9 +386,9 @@ class GACPolicy(BasePolicy):
 
         :param tau: in [0, 1]
         """
-        for critic, target in self.critic_pairs:
-            polyak_update(critic.parameters(), target.parameters(), tau)
-            polyak_update(get_parameters_by_name(critic, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
+        polyak_average(self._critic_parameters, self._target_parameters, tau)
+        if self._critic_statistics:
+            polyak_average(self._critic_statistics, self._target_statistics, 1.0)
 
     def predict(
         self,

@@ -13,7 +13,7 @@ from tests.helpers import TwoViewBandit, small_model
 LOGGED = {
     *("kl", "kl_p95", "kl_above_target", "target_kl", "kl_coef", "kl_coef_loss", "kl_coef_on_bound"),
     *("entropy", "ent_coef", "ent_coef_loss", "actor_loss", "guider_loss", "critic_loss", "log_std_loss"),
-    *("guider_critic_loss", "learner_critic_loss", "guider_q_mean", "learner_q_mean", "learning_rate", "n_updates"),
+    *("guider_critic_loss", "learner_critic_loss", "guider_critic_q", "learner_critic_q", "learning_rate", "n_updates"),
     *("guider_grad_norm", "learner_grad_norm", "guider_critic_grad_norm", "learner_critic_grad_norm"),
 }
 
@@ -48,7 +48,7 @@ def test_critic_targets_match_an_independent_computation(guider):
         model.policy.guider.mean.bias.add_(0.3)
     batch = model._sample_batch(32)
     th.manual_seed(5)
-    guided, of_learner = (target.double().numpy() for target in model._critic_targets(batch))
+    guided, of_learner = (target.double().numpy() for target in model._critic_targets(batch).values())
 
     th.manual_seed(5)
     guider_noise, learner_noise = (th.randn(32, 1).double().numpy() for _ in range(2))
