@@ -95,7 +95,7 @@ class GuiderLearnerEvalCallback(EvalCallback):
         if self._directory is not None:
             np.savez(
                 self._directory / "guider_evaluations.npz",
-                **{name: np.array([entry.get(name, np.nan) for entry in self.history]) for name in self.history[-1]},
+                **{name: np.array([entry.get(name, np.nan) for entry in self.history]) for name in self.history[-1]},  # type: ignore[arg-type]
             )
         self._warn_if_not_following(guider_returns, learner_returns)
 

@@ -63,9 +63,7 @@ def log_tanh_derivative(pre_tanh: th.Tensor) -> th.Tensor:
     return 2.0 * (math.log(2.0) - pre_tanh - F.softplus(-2.0 * pre_tanh))
 
 
-def kl_shared_std(
-    guider_mean: th.Tensor, learner_mean: th.Tensor, std: th.Tensor, reduction: str = "mean"
-) -> th.Tensor:
+def kl_shared_std(guider_mean: th.Tensor, learner_mean: th.Tensor, std: th.Tensor, reduction: str = "mean") -> th.Tensor:
     """
     KL(mu || pi) of two diagonal Gaussians with one std; tanh is a bijection, so it is also the KL after it.
 

@@ -66,9 +66,7 @@ def guided_target(
     return reward + discount * (1 - done) * next_value
 
 
-def learner_target(
-    reward: th.Tensor, done: th.Tensor, next_q: th.Tensor, discount: th.Tensor | float
-) -> th.Tensor:
+def learner_target(reward: th.Tensor, done: th.Tensor, next_q: th.Tensor, discount: th.Tensor | float) -> th.Tensor:
     """
     Bellman target of the learner critics (eq. 15): the plain return, neither KL nor entropy.
 
@@ -115,9 +113,7 @@ def guider_loss(
     return masked_mean(kl_coef * kl + ent_coef * log_prob - q.amin(dim=0), mask)
 
 
-def learner_loss(
-    kl: th.Tensor, q: th.Tensor, kl_coef: th.Tensor | float, mask: th.Tensor | None = None
-) -> th.Tensor:
+def learner_loss(kl: th.Tensor, q: th.Tensor, kl_coef: th.Tensor | float, mask: th.Tensor | None = None) -> th.Tensor:
     """
     Learner objective (eq. 16): follow the guider, and climb the learner's own critics.
 

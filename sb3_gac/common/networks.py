@@ -1,5 +1,6 @@
 """Building blocks of the policies: an ensemble of Q-networks evaluated at once."""
 
+import itertools
 from collections.abc import Iterable
 from typing import Any
 
@@ -39,7 +40,8 @@ class RoleModel(BaseModel):
         :return: shape (B, F)
         """
         assert isinstance(self.observation_space, spaces.Dict)
-        return super().extract_features({key: obs[key] for key in self.observation_space.spaces}, features_extractor)
+        own_entries = {key: obs[key] for key in self.observation_space.spaces}  # type: ignore[index]
+        return super().extract_features(own_entries, features_extractor)
 
 
 class EnsembleLinear(nn.Module):
@@ -101,7 +103,7 @@ class CriticEnsemble(RoleModel):
         self.n_critics = n_critics
         sizes = [features_dim + get_action_dim(action_space), *net_arch]
         layers: list[nn.Module] = []
-        for in_features, out_features in zip(sizes[:-1], sizes[1:], strict=True):
+        for in_features, out_features in itertools.pairwise(sizes):
             layers += [EnsembleLinear(n_critics, in_features, out_features), activation_fn()]
         self.q_networks = nn.Sequential(*layers, EnsembleLinear(n_critics, sizes[-1], 1))
 

@@ -270,10 +270,10 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         samples = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
         return Batch(
-            samples.observations,  # type: ignore[arg-type]
+            samples.observations,
             samples.actions,
             samples.rewards.flatten(),
-            samples.next_observations,  # type: ignore[arg-type]
+            samples.next_observations,
             samples.dones.flatten(),
             self.gamma if samples.discounts is None else samples.discounts.flatten(),
         )

@@ -47,7 +47,7 @@ def resolve_role_keys(observation_space: spaces.Space, role_keys: RoleKeys | Non
             f'The observation has no entry "{PARTIAL}" (its entries are {list(entries)}). Rename the entry that the '
             f'learner may see to "{PARTIAL}", or name it with role_keys={{"learner": ["<entry>"]}}.'
         )
-    resolved = {role: entries for role in ROLES} | {"learner": (PARTIAL,)}
+    resolved = dict.fromkeys(ROLES, entries) | {"learner": (PARTIAL,)}
     for role, keys in role_keys.items():
         if isinstance(keys, str) or not keys:
             raise ValueError(f'role_keys["{role}"] must be a non-empty list of observation entries, got {keys!r}.')
@@ -77,7 +77,7 @@ def resolve_net_arch(net_arch: list[int] | Mapping[str, list[int]] | None) -> di
     if net_arch is None:
         net_arch = [256, 256]
     if isinstance(net_arch, list):
-        return {role: net_arch for role in ROLES}
+        return dict.fromkeys(ROLES, net_arch)
     if set(net_arch) == {"pi", "qf"}:
         net_arch = {"guider": net_arch["pi"], "learner": net_arch["pi"], "critic": net_arch["qf"]}
     if set(net_arch) != {"guider", "learner", "critic"}:

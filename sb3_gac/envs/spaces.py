@@ -41,4 +41,4 @@ def concatenate_boxes(boxes: Sequence[spaces.Box]) -> spaces.Box:
     :return: joined along the first axis
     """
     low, high = np.concatenate([box.low for box in boxes]), np.concatenate([box.high for box in boxes])
-    return spaces.Box(low, high, dtype=boxes[0].dtype)  # type: ignore[arg-type]
+    return spaces.Box(low, high, dtype=boxes[0].dtype)

@@ -24,7 +24,7 @@ _NOISE_STREAM = 0x6E6F697365  # keeps the noise apart from generators that other
 
 def _reset(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
     """Reset with those keywords that were given: not every environment knows both."""
-    given = {name: value for name, value in {"seed": seed, "options": options}.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in {"seed": seed, "options": options}.items() if value is not None}
     return env.reset(**given)
 
 
@@ -166,14 +166,14 @@ class SensorNoise(_EntryWrapper):
         self.noise_std = np.asarray(noise_std, dtype=np.float32)
         if not (np.isfinite(self.noise_std).all() and (self.noise_std >= 0).all()):
             raise ValueError(f"noise_std must be a finite number >= 0, or one per component, got {noise_std!r}.")
-        if not np.issubdtype(self._entry.dtype, np.floating):  # type: ignore[arg-type]
+        if not np.issubdtype(self._entry.dtype, np.floating):
             raise ValueError(f'SensorNoise needs a floating-point entry, but "{key}" has {self._entry}.')
         if self.noise_std.shape not in ((), self._entry.shape):
             raise ValueError(f"noise_std must be a number or have the entry's shape {self._entry.shape}, got {noise_std!r}.")
         noisy = np.broadcast_to(self.noise_std, self._entry.shape) > 0
         low, high = np.where(noisy, -np.inf, self._entry.low), np.where(noisy, np.inf, self._entry.high)
         dtype = self._entry.dtype
-        self._set_entry_space(spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype))  # type: ignore[arg-type]
+        self._set_entry_space(spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype))
         self._stream = [_NOISE_STREAM] * (1 + _count_wrappers(env, SensorNoise))  # apart from noise further in
         self._generator = np.random.default_rng()
 
@@ -209,7 +209,7 @@ class History(_EntryWrapper):
             raise ValueError(f"length must be at least 1, got {length}.")
         if not self._entry.shape:
             raise ValueError(f'History needs an entry with at least one axis, but "{key}" has {self._entry}.')
-        is_vector = len(self._entry.shape) == 1 and np.issubdtype(self._entry.dtype, np.floating)  # type: ignore[arg-type]
+        is_vector = len(self._entry.shape) == 1 and np.issubdtype(self._entry.dtype, np.floating)
         if actions and not (isinstance(env.action_space, spaces.Box) and is_vector):
             raise ValueError(
                 f'actions=True needs Box actions and a one-dimensional, floating-point entry "{key}", but the environment '

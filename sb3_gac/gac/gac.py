@@ -183,7 +183,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         metrics = self._update_critics(batch)
         policy_metrics, kl, log_prob = self._update_policies(batch.observations)
         metrics |= policy_metrics
-        ent_metrics = self.ent_coef_dual.update(log_prob + self.target_entropy)
+        ent_metrics = self.ent_coef_dual.update(log_prob + float(self.target_entropy))
         kl_metrics = self.kl_coef_dual.update(kl - self.current_target_kl)
         metrics |= {f"ent_coef_{name}": value for name, value in ent_metrics.items() if name == "loss"}
         metrics |= {f"kl_coef_{name}": value for name, value in kl_metrics.items()}
@@ -196,7 +196,8 @@ class GAC(AsymmetricOffPolicyAlgorithm):
 
     def _update_critics(self, batch: Batch) -> Metrics:
         """Eqs. 12 and 15, all critics in one backward pass."""
-        losses, metrics = [], {}
+        losses: list[th.Tensor] = []
+        metrics: Metrics = {}
         targets = self._critic_targets(batch)
         for name, target in targets.items():
             q = getattr(self.policy, name)(batch.observations, batch.actions)

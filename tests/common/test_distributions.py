@@ -69,7 +69,9 @@ def test_kl_is_torchs_own():
     case = golden("kl_shared_std", th.float64)
     std = case["log_std"].exp()
     normals = [th.distributions.Normal(case[name], std) for name in ("guider_mean", "learner_mean")]
-    assert_close(kl_shared_std(*(normal.mean for normal in normals), std, "sum"), th.distributions.kl_divergence(*normals).sum(-1))
+    assert_close(
+        kl_shared_std(*(normal.mean for normal in normals), std, "sum"), th.distributions.kl_divergence(*normals).sum(-1)
+    )
 
 
 @DTYPES

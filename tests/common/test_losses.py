@@ -38,9 +38,7 @@ def test_learner_target_eq15(dtype):
 def test_guider_and_learner_objectives(dtype):
     case = golden("actor_losses", dtype)
     coefficients = (case["kl_coef"], case["ent_coef"])
-    assert_close(
-        losses.guider_loss(case["kl"], case["log_prob"], case["q_guider"], *coefficients), case["guider_loss_eq13"]
-    )
+    assert_close(losses.guider_loss(case["kl"], case["log_prob"], case["q_guider"], *coefficients), case["guider_loss_eq13"])
     assert_close(losses.learner_loss(case["kl"], case["q_learner"], case["kl_coef"]), case["learner_loss_eq16"])
     assert_close(losses.learner_loss(case["kl"], case["q_guider"], case["kl_coef"]), case["learner_loss_share"])
     assert_close(losses.distillation_loss(case["kl"]), case["learner_loss_eq14"])

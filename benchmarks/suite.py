@@ -1,0 +1,84 @@
+"""A suite: which algorithms, on which tasks, at which noise levels, with which seeds. Read from YAML, checked by name."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+HERE = Path(__file__).parent
+_SUITE_KEYS = {"steps", "envs", "preset", "eval_every", "eval_episodes", "overrides", "cells"}
+_CELL_KEYS = {"task", "noises", "algorithms", "seeds"}
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """
+    One training run.
+
+    :param algorithm: a name in ``hyperparams/algorithms.yml``
+    :param task: as in ``sb3_gac/<task>-v5``
+    :param noise: standard deviation of the sensor noise
+    :param seed: of everything random
+    :param steps: environment steps
+    :param envs: environments side by side
+    :param preset: of sb3_gac, the arguments to start from
+    :param eval_every: environment steps between evaluations
+    :param eval_episodes: of each evaluation
+    :param overrides: arguments of the algorithm that replace those of the preset
+    """
+
+    algorithm: str
+    task: str
+    noise: float
+    seed: int
+    steps: int
+    envs: int
+    preset: str
+    eval_every: int
+    eval_episodes: int
+    overrides: dict[str, Any] = field(default_factory=dict)
+
+    def directory(self, root: Path) -> Path:
+        """Where this run's files go."""
+        return root / f"{self.task}-noise{self.noise:g}" / self.algorithm / f"seed{self.seed}"
+
+
+def read_suite(path: Path) -> list[RunSpec]:
+    """
+    :param path: YAML file
+    :return: its runs; all seeds of a cell before the next cell
+    :raises ValueError: if a key is unknown or missing
+    """
+    suite = yaml.safe_load(path.read_text())
+    _check_keys(path.name, suite, _SUITE_KEYS, _SUITE_KEYS - {"overrides"})
+    return [spec for cell in suite["cells"] for spec in _cell_runs(path.name, suite, cell)]
+
+
+def _cell_runs(name: str, suite: dict[str, Any], cell: dict[str, Any]) -> Iterator[RunSpec]:
+    _check_keys(f"{name}, a cell", cell, _CELL_KEYS, _CELL_KEYS)
+    common = {key: suite[key] for key in ("steps", "envs", "preset", "eval_every", "eval_episodes")}
+    for noise in cell["noises"]:
+        for seed in cell["seeds"]:
+            for algorithm in cell["algorithms"]:
+                overrides = suite.get("overrides", {})
+                yield RunSpec(algorithm, cell["task"], float(noise), seed, overrides=overrides, **common)
+
+
+def read_algorithm(name: str) -> dict[str, Any]:
+    """
+    :param name: of an algorithm
+    :return: its class name under "class", and its arguments
+    :raises ValueError: if it is not in ``hyperparams/algorithms.yml``
+    """
+    algorithms = yaml.safe_load((HERE / "hyperparams" / "algorithms.yml").read_text())
+    if name not in algorithms:
+        raise ValueError(f"algorithm must be one of {sorted(algorithms)}, got {name!r}.")
+    return dict(algorithms[name])
+
+
+def _check_keys(where: str, mapping: dict[str, Any], known: set[str], required: set[str]) -> None:
+    unknown, missing = sorted(set(mapping) - known), sorted(required - set(mapping))
+    if unknown or missing:
+        raise ValueError(f"{where}: unknown keys {unknown}, missing keys {missing}; the keys are {sorted(known)}.")
