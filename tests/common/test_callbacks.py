@@ -1,0 +1,288 @@
+"""Evaluation of guider and learner: same seeds, what is logged and saved, and the three warnings."""
+
+import os
+import re
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import StopTrainingOnRewardThreshold
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_gac import GAC, GuiderLearnerEvalCallback
+
+EPISODE_LENGTH = 5
+
+
+class Paid(gym.Env):
+    """The reward is the action plus a bonus drawn at reset, which only the privileged entry shows."""
+
+    observation_space = spaces.Dict(
+        partial=spaces.Box(-np.inf, np.inf, (2,), np.float32), privileged=spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    )
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, spread=1.0):
+        self.spread = spread
+        self.starts = []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps, self.bonus = 0, self.spread * self.np_random.uniform(-1, 1)
+        observation = self._observe()
+        self.starts.append(np.concatenate([*observation.values()]).tolist())
+        return observation, {}
+
+    def step(self, action):
+        self.steps += 1
+        return self._observe(), float(action[0]) + self.bonus, False, self.steps == EPISODE_LENGTH, {}
+
+    def _observe(self):
+        partial = self.np_random.normal(3.0, 2.0, 2).astype(np.float32)
+        return {"partial": partial, "privileged": np.float32([self.bonus])}
+
+
+class Memory(KVWriter):
+    """A log in a list."""
+
+    def __init__(self):
+        self.rows = []
+
+    def write(self, key_values, key_excluded, step=0):
+        self.rows.append({**key_values, "step": step})
+
+
+def _vec_env(n_envs=1):
+    return DummyVecEnv([lambda: Monitor(Paid()) for _ in range(n_envs)])
+
+
+def _model(env, **kwargs):
+    arguments = {"learning_starts": 1, "batch_size": 8, "buffer_size": 200, "seed": 0, "device": "cpu"} | kwargs
+    return GAC("MultiInputPolicy", env, guider="independent", policy_kwargs={"net_arch": [8]}, **arguments)
+
+
+def _callback(eval_env, **kwargs):
+    return GuiderLearnerEvalCallback(
+        eval_env, **{"eval_freq": 10, "n_eval_episodes": 4, "patience": 100, "verbose": 0} | kwargs
+    )
+
+
+def _mean_return(predict, env, seed=10_000):
+    env.seed(seed)
+    return evaluate_policy(type("Policy", (), {"predict": staticmethod(predict)}), env, n_eval_episodes=4)[0]
+
+
+# --- evaluation ------------------------------------------------------------------------------------------------------
+
+
+def test_logs_both_returns_at_every_evaluation():
+    model, memory = _model(_vec_env()), Memory()
+    model.set_logger(Logger(None, [memory]))
+    model.learn(30, callback=_callback(_vec_env()), log_interval=1)
+    evaluations = [row for row in memory.rows if "eval/mean_reward" in row]
+    assert [row["step"] for row in evaluations] == [10, 20, 30]
+    assert all(np.isfinite(row["eval/guider_mean_reward"]) for row in evaluations)
+    assert len([row for row in memory.rows if "eval/guider_mean_reward" in row]) == 3
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_returns_are_those_of_the_two_policies_from_the_same_seeds(n_envs):
+    model = _model(_vec_env(), learning_starts=100)  # does not learn
+    callback = _callback(_vec_env(n_envs), eval_seed=77)
+    model.learn(20, callback=callback)
+    guider = _mean_return(model.predict_guider, _vec_env(n_envs), seed=77)
+    learner = _mean_return(model.predict, _vec_env(n_envs), seed=77)
+    assert guider != pytest.approx(learner)
+    assert [row["timesteps"] for row in callback.history] == [10, 20]
+    for row in callback.history:
+        assert row["guider"] == pytest.approx(guider)
+        assert row["learner"] == pytest.approx(learner)
+    assert callback.last_mean_reward == pytest.approx(learner)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_both_policies_start_from_the_same_observations_at_every_evaluation(n_envs):
+    eval_env = _vec_env(n_envs)
+    _model(_vec_env()).learn(30, callback=_callback(eval_env))
+    starts = [env.unwrapped.starts for env in eval_env.envs]
+    n_resets = 1 + 4 // n_envs  # one more than there are episodes
+    for of_env in starts:
+        chunks = [of_env[i : i + n_resets] for i in range(0, len(of_env), n_resets)]
+        assert len(chunks) == 3 * 2
+        assert all(chunk == chunks[0] for chunk in chunks)
+        assert len({tuple(start) for start in chunks[0]}) == n_resets
+    assert starts[0] != starts[-1] or n_envs == 1
+
+
+def test_works_under_vec_normalize():
+    env = VecNormalize(_vec_env())
+    eval_env = VecNormalize(_vec_env(), training=False, norm_reward=False)
+    model = _model(env, learning_starts=100)
+    callback = _callback(eval_env)
+    model.learn(20, callback=callback)
+    for key, statistics in env.obs_rms.items():
+        assert np.array_equal(statistics.mean, eval_env.obs_rms[key].mean)
+        assert statistics.count == pytest.approx(21, abs=0.1)  # evaluation does not count
+    assert env.obs_rms["partial"].mean == pytest.approx(3, abs=1.5)
+    assert callback.history[-1]["guider"] == pytest.approx(_mean_return(model.predict_guider, eval_env))
+    assert callback.history[-1]["learner"] == pytest.approx(_mean_return(model.predict, eval_env))
+
+
+def test_a_single_environment_will_do():
+    callback = _callback(Monitor(Paid()), n_eval_episodes=1)
+    _model(_vec_env()).learn(10, callback=callback)
+    assert len(callback.history) == 1
+
+
+def test_evaluation_does_not_change_training():
+    with_callback, without = (_model(_vec_env()).learn(20, callback=callback) for callback in (_callback(_vec_env()), None))
+    for first, second in zip(with_callback.policy.parameters(), without.policy.parameters(), strict=True):
+        assert th.equal(first, second)
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+def test_saves_both_evaluations_and_the_best_model(tmp_path):
+    logs, best = tmp_path / "some" / "logs", tmp_path / "best"
+    model = _model(_vec_env(), learning_starts=12)
+    callback = _callback(_vec_env(), log_path=str(logs), best_model_save_path=str(best))
+    model.learn(30, callback=callback)
+    saved = np.load(logs / "guider_evaluations.npz")
+    of_sb3 = np.load(logs / "evaluations.npz")
+    assert saved["timesteps"].tolist() == of_sb3["timesteps"].tolist() == [10, 20, 30]
+    assert saved["learner"] == pytest.approx(of_sb3["results"].mean(axis=1))
+    assert of_sb3["results"].shape == (3, 4)
+    assert np.isfinite(saved["guider"]).all()
+    for name in ("kl", "target_kl", "kl_coef", "kl_coef_on_bound"):
+        assert np.isnan(saved[name]).tolist() == [True, False, False]  # no gradient step before the first evaluation
+    assert saved["target_kl"][1:] == pytest.approx(0.0033)
+    assert callback.best_mean_reward == saved["learner"].max()
+    observation, _ = Paid().reset(seed=0)
+    assert Paid.action_space.contains(GAC.load(best / "best_model").predict({"partial": observation["partial"]})[0])
+
+
+def test_writes_nothing_without_a_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    _model(_vec_env()).learn(10, callback=_callback(_vec_env()))
+    assert os.listdir(tmp_path) == []
+
+
+def test_stops_training_when_a_child_callback_says_so():
+    model = _model(_vec_env())
+    callback = _callback(_vec_env(), callback_on_new_best=StopTrainingOnRewardThreshold(-1000.0))
+    model.learn(30, callback=callback)
+    assert model.num_timesteps == 10
+    assert len(callback.history) == 1
+
+
+# --- warnings --------------------------------------------------------------------------------------------------------
+
+
+class Scripted:
+    """A model whose two policies, and what its gradient steps log, are set by hand."""
+
+    def __init__(self):
+        self.logger = Logger(None, [])
+        self.num_timesteps = 0
+        self.actions = {}
+        self._env = DummyVecEnv([Paid])
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.full((1, 1), self.actions["learner"]), state
+
+    def predict_guider(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.full((1, 1), self.actions["guider"]), state
+
+    def get_env(self):
+        return self._env
+
+    def get_vec_normalize_env(self):
+        return None
+
+
+HEALTHY = {"guider": 1.0, "learner": 0.9, "kl": 0.01, "target_kl": 0.01, "kl_coef": 1.0, "kl_coef_on_bound": 0.0}
+UNHEALTHY = {
+    "kl": ({"kl": 0.021}, "does not keep up"),
+    "kl, target 0": ({"target_kl": 0.0}, "does not keep up"),
+    "bound": ({"kl_coef_on_bound": 1.0, "kl_coef": 100.0}, r"kl_coef sits on a bound \(1e\+02\)"),
+    "gap": ({"learner": 0.7}, "the guider returns 5 and the learner 3.5"),
+    "gap, negative returns": ({"guider": -1.0, "learner": -1.5}, "the guider returns -5 and the learner -7.5"),
+}
+
+
+def _evaluator(spread=0.0, **kwargs):
+    """A function that evaluates once, with ``HEALTHY`` changed as it is told, and returns the warnings."""
+    model = Scripted()
+    callback = _callback(DummyVecEnv([lambda: Paid(spread)]), eval_freq=1, warn=False, **kwargs)
+    callback.init_callback(model)
+
+    def evaluate(**changed):
+        state = HEALTHY | changed
+        model.actions = {name: state.pop(name) for name in ("guider", "learner")}
+        for name, value in state.items():
+            model.logger.record(f"train/{name}", value)
+        callback.on_rollout_start()
+        model.logger.dump()  # as at the end of an episode: forgets what was logged
+        model.num_timesteps += 1
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            assert callback.on_step()
+        return [str(warning.message) for warning in caught]
+
+    return evaluate
+
+
+@pytest.mark.parametrize("patience", [1, 3])
+@pytest.mark.parametrize(("sick", "message"), UNHEALTHY.values(), ids=UNHEALTHY.keys())
+def test_warns_once_after_patience_evaluations_in_a_row(sick, message, patience):
+    evaluate = _evaluator(patience=patience)
+    for _ in range(2):  # a second time after it has been healthy again
+        assert [evaluate(**sick) for _ in range(patience - 1)] == [[]] * (patience - 1)
+        (warning,) = evaluate(**sick)
+        assert re.match(rf"After \d+ steps, .*{message}", warning)
+        assert evaluate(**sick) == []
+        assert evaluate() == []
+
+
+@pytest.mark.parametrize(("sick", "message"), UNHEALTHY.values(), ids=UNHEALTHY.keys())
+def test_a_healthy_evaluation_in_between_starts_the_count_again(sick, message):
+    evaluate = _evaluator(patience=2)
+    assert [evaluate(**sick), evaluate(), evaluate(**sick), evaluate()] == [[]] * 4
+
+
+@pytest.mark.parametrize(
+    "healthy",
+    [
+        {},
+        {"kl": 0.02},  # twice the target, no more
+        {"kl_coef_on_bound": 0.5},
+        {"learner": 0.85},  # a gap of 0.15 within the tolerance of 0.2
+        {"learner": 2.0},  # better than the guider
+        {"guider": -1.0, "learner": -1.1},
+    ],
+)
+def test_says_nothing_while_all_is_well(healthy):
+    evaluate = _evaluator(patience=1)
+    assert [evaluate(**healthy) for _ in range(2)] == [[], []]
+
+
+def test_gap_must_exceed_tolerance_and_two_standard_errors():
+    assert len(_evaluator(patience=1, gap_tolerance=0.2)(learner=0.7)) == 1
+    assert _evaluator(patience=1, gap_tolerance=0.4)(learner=0.7) == []
+    assert _evaluator(patience=1, spread=2.0)(learner=0.7) == []
+
+
+def test_says_nothing_before_there_were_gradient_steps():
+    callback = _callback(_vec_env(), eval_freq=2, patience=1, gap_tolerance=1e6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _model(_vec_env(), learning_starts=100).learn(6, callback=callback)
+    assert len(callback.history) == 3
+    assert "kl" not in callback.history[-1]

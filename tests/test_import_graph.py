@@ -1,0 +1,49 @@
+"""Who may import whom."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+import sb3_gac
+
+ROOT = Path(sb3_gac.__file__).parents[1]
+BASELINES = sorted({path.stem for path in (ROOT / "sb3_gac/baselines").glob("[!_]*")})
+FORBIDDEN = {
+    "sb3_gac/common/losses.py": r"sb3_gac",
+    "sb3_gac/common/distributions.py": r"sb3_gac",
+    "sb3_gac/common/dual.py": r"sb3_gac(?!\.common\.losses\b)",
+    "sb3_gac/common/**/*.py": r"sb3_gac(?!\.(common|envs)\b)",
+    "sb3_gac/envs/**/*.py": r"torch\b|stable_baselines3|sb3_gac(?!\.envs\b)",
+    **{
+        f"sb3_gac/baselines/{pattern.format(name)}": rf"sb3_gac(?!\.(common|envs|version|baselines\.{name})\b)"
+        for name in BASELINES
+        for pattern in ("{}.py", "{}/**/*.py")
+    },
+    "benchmarks/**/*.py": r"sb3_gac\.(.*\.)?_(?!_)",
+}
+
+
+def _imports(source):
+    """Dotted names of all that is imported, functions' own imports included."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{'.' * node.level}{node.module or ''}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("pattern", FORBIDDEN)
+def test_imports_nothing_forbidden(pattern):
+    for path in ROOT.glob(pattern):
+        found = [name for name in _imports(path.read_text()) if re.match(rf"\.|{FORBIDDEN[pattern]}", name)]
+        assert not found, f"{path.relative_to(ROOT)} imports {found}"
+
+
+def test_finds_every_kind_of_import():
+    source = (
+        "import torch.nn, os\nfrom sb3_gac import GAC as G\ndef f():\n    from sb3_gac.gac import gac\n    from . import a"
+    )
+    assert list(_imports(source)) == ["torch.nn", "os", "sb3_gac.GAC", "sb3_gac.gac.gac", "..a"]
+    assert all(list(ROOT.glob(pattern)) for pattern in FORBIDDEN if "baselines" not in pattern and "benchmarks" not in pattern)
