@@ -310,8 +310,7 @@ class GACPolicy(BasePolicy):
         critics, targets = zip(*self.critic_pairs, strict=True)
         self._critic_parameters: list[th.Tensor] = [p for critic in critics for p in critic.parameters()]
         self._target_parameters: list[th.Tensor] = [p for target in targets for p in target.parameters()]
-        self._critic_statistics = [s for critic in critics for s in get_parameters_by_name(critic, ["running_"])]
-        self._target_statistics = [s for target in targets for s in get_parameters_by_name(target, ["running_"])]
+        self._has_statistics = any(get_parameters_by_name(critic, ["running_"]) for critic in critics)
         self.network_parameters: dict[str, list[nn.Parameter]] = {
             "guider": trainable(self.guider.parameters()),
             "learner": trainable(self.learner.mean_parameters()),
@@ -387,8 +386,10 @@ class GACPolicy(BasePolicy):
         :param tau: in [0, 1]
         """
         polyak_average(self._critic_parameters, self._target_parameters, tau)
-        if self._critic_statistics:
-            polyak_average(self._critic_statistics, self._target_statistics, 1.0)
+        if not self._has_statistics:
+            return
+        for critic, target in self.critic_pairs:  # not collected once: a move to another device replaces buffers
+            polyak_average(get_parameters_by_name(critic, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
 
     def predict(
         self,
