@@ -7,15 +7,20 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
-from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.preprocessing import get_action_dim, preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 
-def trainable(parameters: Iterable[nn.Parameter]) -> list[nn.Parameter]:
-    """Those that an optimiser may change: parts of an encoder may be frozen."""
-    return [parameter for parameter in parameters if parameter.requires_grad]
+def trainable(parameters: Iterable[nn.Parameter], but: Iterable[nn.Parameter] = ()) -> list[nn.Parameter]:
+    """
+    :param parameters: of a network; parts of an encoder may be frozen
+    :param but: those that belong to another network
+    :return: those that the network's optimiser may change
+    """
+    others = {id(parameter) for parameter in but}
+    return [parameter for parameter in parameters if parameter.requires_grad and id(parameter) not in others]
 
 
 def polyak_average(parameters: list[th.Tensor], targets: list[th.Tensor], tau: float) -> None:
@@ -31,17 +36,31 @@ def polyak_average(parameters: list[th.Tensor], targets: list[th.Tensor], tau: f
 
 
 class RoleModel(BaseModel):
-    """A network that reads only the observation entries of its role, whatever else the observation holds."""
+    """
+    A network that reads only the observation entries of its role, whatever else the observation holds.
+
+    Where the learner's encoder is shared, ``features_extractor`` is the learner's, which the learner's loss alone
+    trains, and ``rest_extractor`` encodes the entries that the learner does not read.
+    """
+
+    rest_extractor: BaseFeaturesExtractor | None
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         """
         :param obs: observation with at least the entries of this role
-        :param features_extractor: the role's extractor
+        :param features_extractor: the role's extractor, or the learner's
         :return: shape (B, F)
         """
-        assert isinstance(self.observation_space, spaces.Dict)
-        own_entries = {key: obs[key] for key in self.observation_space.spaces}  # type: ignore[index]
-        return super().extract_features(own_entries, features_extractor)
+        if self.rest_extractor is None:
+            return self._encode(obs, self.observation_space, features_extractor)
+        with th.no_grad():
+            shared = self._encode(obs, features_extractor._observation_space, features_extractor)
+        return th.cat([shared, self._encode(obs, self.rest_extractor._observation_space, self.rest_extractor)], dim=-1)
+
+    def _encode(self, obs: PyTorchObs, space: spaces.Space, extractor: BaseFeaturesExtractor) -> th.Tensor:
+        assert isinstance(space, spaces.Dict)
+        entries = {key: obs[key] for key in space.spaces}  # type: ignore[index]
+        return extractor(preprocess_obs(entries, space, normalize_images=self.normalize_images))
 
 
 class EnsembleLinear(nn.Module):
@@ -78,6 +97,8 @@ class CriticEnsemble(RoleModel):
     :param features_dim: its output size, F
     :param activation_fn: between layers
     :param normalize_images: divide images by 255
+    :param rest_extractor: encoder of the entries that the learner does not read, if ``features_extractor`` is the
+        learner's
     :param n_critics: size of the ensemble, N
     """
 
@@ -92,11 +113,13 @@ class CriticEnsemble(RoleModel):
         features_dim: int,
         activation_fn: type[nn.Module] = nn.SiLU,
         normalize_images: bool = True,
+        rest_extractor: BaseFeaturesExtractor | None = None,
         n_critics: int = 2,
     ):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
+        self.rest_extractor = rest_extractor
         self.net_arch = net_arch
         self.features_dim = features_dim
         self.activation_fn = activation_fn
@@ -123,5 +146,6 @@ class CriticEnsemble(RoleModel):
             "features_extractor": self.features_extractor,
             "features_dim": self.features_dim,
             "activation_fn": self.activation_fn,
+            "rest_extractor": self.rest_extractor,
             "n_critics": self.n_critics,
         }

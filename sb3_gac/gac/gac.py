@@ -24,7 +24,8 @@ from sb3_gac.common.losses import (
 )
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm, Batch, Metrics, clip_gradients
 from sb3_gac.common.roles import RoleKeys
-from sb3_gac.gac.policies import GUIDERS, GACPolicy, MultiInputPolicy
+from sb3_gac.gac.actors import GUIDERS
+from sb3_gac.gac.policies import GACPolicy, MultiInputPolicy
 
 KL_COEF_START = 1.0
 

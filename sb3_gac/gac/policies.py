@@ -1,196 +1,22 @@
 """Guider, learner and four critics: the networks of Guided Actor-Critic for Box actions."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
-from sb3_gac.common.distributions import TanhGaussian, project_to_kl_ball
-from sb3_gac.common.networks import CriticEnsemble, RoleModel, polyak_average, trainable
+from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.common.networks import CriticEnsemble, polyak_average, trainable
 from sb3_gac.common.roles import RoleKeys, resolve_net_arch, resolve_role_keys, role_space
-
-DELTA_INIT_SCALE = 0.01
-LOG_STD_BOUNDS = (-5.0, 1.0)
-
-
-class RolePolicy(RoleModel, BasePolicy):
-    """
-    A policy network on the entries of its role: encoder and hidden layers; subclasses add the heads.
-
-    :param observation_space: the entries that this role reads
-    :param action_space: Box
-    :param net_arch: hidden layer sizes
-    :param features_extractor: encoder of the entries
-    :param features_dim: its output size
-    :param activation_fn: between layers
-    :param normalize_images: divide images by 255
-    :param log_std_bounds: smallest and largest log standard deviation before tanh
-    """
-
-    features_extractor: BaseFeaturesExtractor
-
-    def __init__(
-        self,
-        observation_space: spaces.Dict,
-        action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: BaseFeaturesExtractor,
-        features_dim: int,
-        activation_fn: type[nn.Module] = nn.SiLU,
-        normalize_images: bool = True,
-        log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
-    ):
-        super().__init__(
-            observation_space,
-            action_space,
-            features_extractor=features_extractor,
-            normalize_images=normalize_images,
-            squash_output=True,
-        )
-        self.net_arch = net_arch
-        self.features_dim = features_dim
-        self.activation_fn = activation_fn
-        self.log_std_bounds = log_std_bounds
-        self.latent_net = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
-        latent_dim = net_arch[-1] if net_arch else features_dim
-        action_dim = get_action_dim(action_space)
-        self.mean = nn.Linear(latent_dim, action_dim)
-        self.log_std = nn.Linear(latent_dim, action_dim)
-
-    def latent(self, obs: PyTorchObs) -> th.Tensor:
-        """
-        :param obs: observation with at least the entries of this role, B of each
-        :return: last hidden layer, shape (B, H)
-        """
-        return self.latent_net(self.extract_features(obs, self.features_extractor))
-
-    def bounded_log_std(self, latent: th.Tensor) -> th.Tensor:
-        """
-        :param latent: shape (B, H)
-        :return: log standard deviation before tanh, shape (B, A)
-        """
-        return self.log_std(latent).clamp(*self.log_std_bounds)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | {
-            "net_arch": self.net_arch,
-            "features_extractor": self.features_extractor,
-            "features_dim": self.features_dim,
-            "activation_fn": self.activation_fn,
-            "log_std_bounds": self.log_std_bounds,
-        }
-
-
-class Learner(RolePolicy):
-    """
-    The deployed policy: a mean on the learner's entries.
-
-    In training it borrows the guider's std. Its own log-std head, fitted to the guider's, serves
-    ``predict(deterministic=False)`` where there is no guider.
-    """
-
-    def forward(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
-        """
-        :param obs: observation with at least the learner's entries, B of each
-        :return: mean before tanh, and the deployment log std, whose gradient stops at its head; both (B, A)
-        """
-        latent = self.latent(obs)
-        return self.mean(latent), self.bounded_log_std(latent.detach())
-
-    def mean_parameters(self) -> list[nn.Parameter]:
-        """All parameters but those of the deployment log-std head, whose loss is another."""
-        return [parameter for name, parameter in self.named_parameters() if not name.startswith("log_std.")]
-
-    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
-        """
-        :param observation: single or batched; a dict with at least the learner's entries, or, where the learner reads
-            one entry, that entry alone
-        :return: tensors of the learner's entries, and whether they were batched
-        :raises ValueError: if one of the learner's entries is missing
-        """
-        return super().obs_to_tensor(self._own_entries(observation))
-
-    def _own_entries(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        assert isinstance(self.observation_space, spaces.Dict)
-        keys = list(self.observation_space.spaces)
-        if not isinstance(observation, Mapping):
-            if len(keys) > 1:
-                raise ValueError(f"The learner reads {keys}: pass predict() a dict with these entries, not an array.")
-            return {keys[0]: observation}
-        missing = [key for key in keys if key not in observation]
-        if missing:
-            raise ValueError(f"The observation passed to predict() lacks {missing}, which the learner reads.")
-        return {key: observation[key] for key in keys}
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        action = TanhGaussian(*self(observation))
-        return action.mode if deterministic else action.sample()
-
-
-class Guider(RolePolicy):
-    """
-    The privileged policy in the paper's form: mean and std from its own network, nothing shared with the learner.
-
-    :param max_kl: hard bound on KL(guider || learner), or ``None``: the mean is projected onto that ball
-    :param kl_reduction: how the bounded KL is reduced over action dimensions
-    """
-
-    def __init__(self, *args: Any, max_kl: float | None = None, kl_reduction: str = "mean", **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self.max_kl = max_kl
-        self.kl_reduction = kl_reduction
-
-    def forward(self, obs: PyTorchObs, learner_mean: th.Tensor) -> TanhGaussian:
-        """
-        :param obs: observation with at least the guider's entries, B of each
-        :param learner_mean: the learner's mean for the same observations; treated as a constant, shape (B, A)
-        :return: action distribution, shapes (B, A)
-        """
-        latent = self.latent(obs)
-        log_std = self.bounded_log_std(latent)
-        mean = self._guided_mean(self.mean(latent), learner_mean.detach(), log_std.detach().exp())
-        return TanhGaussian(mean, log_std)
-
-    def _guided_mean(self, output: th.Tensor, learner_mean: th.Tensor, std: th.Tensor) -> th.Tensor:
-        if self.max_kl is None:
-            return output
-        offset = project_to_kl_ball((output - learner_mean) / std, self.max_kl, self.kl_reduction)
-        return learner_mean + std * offset
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        raise TypeError("The guider is defined relative to the learner: use GAC.predict_guider().")
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | {"max_kl": self.max_kl, "kl_reduction": self.kl_reduction}
-
-
-class ResidualGuider(Guider):
-    """
-    The guider as the learner plus a privileged correction delta in units of the std: KL = 1/2 ||delta||^2 exactly.
-
-    Neither the learner's drift nor a shrinking std moves the KL; delta = 0 is the learner itself.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        with th.no_grad():
-            self.mean.weight.mul_(DELTA_INIT_SCALE)
-            self.mean.bias.mul_(DELTA_INIT_SCALE)
-
-    def _guided_mean(self, output: th.Tensor, learner_mean: th.Tensor, std: th.Tensor) -> th.Tensor:
-        delta = output if self.max_kl is None else project_to_kl_ball(output, self.max_kl, self.kl_reduction)
-        return learner_mean + std * delta
-
-
-GUIDERS: dict[str, type[Guider]] = {"residual": ResidualGuider, "independent": Guider}
+from sb3_gac.gac.actors import GUIDERS, LOG_STD_BOUNDS, Guider, Learner
 
 
 class GACPolicy(BasePolicy):
@@ -210,6 +36,9 @@ class GACPolicy(BasePolicy):
     :param log_std_bounds: smallest and largest log standard deviation before tanh
     :param features_extractor_class: encoder, made once per role on the entries of that role
     :param features_extractor_kwargs: keyword arguments for it
+    :param share_features_extractor: whether guider and critics see the learner's features of its entries, as they are,
+        and encode only the other entries themselves; the learner's loss trains that encoder (saves most of the work
+        where ``partial`` is an image)
     :param normalize_images: divide images by 255
     :param optimizer_class: optimiser of policies and critics
     :param optimizer_kwargs: keyword arguments for it, without the learning rate
@@ -234,6 +63,7 @@ class GACPolicy(BasePolicy):
         log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
         features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
+        share_features_extractor: bool = False,
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
@@ -261,6 +91,7 @@ class GACPolicy(BasePolicy):
             "n_critics": n_critics,
         }
         self.role_keys = resolve_role_keys(observation_space, role_keys)
+        self.share_features_extractor = share_features_extractor
         self._net_arch = resolve_net_arch(net_arch)
         self._build_networks(GUIDERS[guider], max_kl, kl_reduction, learner_critics, log_std_bounds, n_critics)
         self._collect_parameters()
@@ -276,31 +107,57 @@ class GACPolicy(BasePolicy):
         n_critics: int,
     ) -> None:
         self.learner = Learner(**self._role_kwargs("learner"), log_std_bounds=log_std_bounds)
+        shared = self.learner.features_extractor if self.share_features_extractor else None
         self.guider = guider_class(
-            **self._role_kwargs("guider"), log_std_bounds=log_std_bounds, max_kl=max_kl, kl_reduction=kl_reduction
+            **self._role_kwargs("guider", shared), log_std_bounds=log_std_bounds, max_kl=max_kl, kl_reduction=kl_reduction
         )
-        self.guider_critic, self.guider_critic_target = self._make_critic_and_target("guider_critic", n_critics)
+        self.guider_critic, self.guider_critic_target = self._make_critic_and_target("guider_critic", n_critics, shared)
         self.learner_critic, self.learner_critic_target = None, None
         if learner_critics:
-            self.learner_critic, self.learner_critic_target = self._make_critic_and_target("learner_critic", n_critics)
+            self.learner_critic, self.learner_critic_target = self._make_critic_and_target("learner_critic", n_critics, shared)
 
-    def _role_kwargs(self, role: str) -> dict[str, Any]:
-        """Constructor arguments of a role's network, with a features extractor of its own."""
-        space = role_space(self.observation_space, self.role_keys[role])  # type: ignore[arg-type]
-        features_extractor = self.features_extractor_class(space, **self.features_extractor_kwargs)
+    def _role_kwargs(self, role: str, shared: BaseFeaturesExtractor | None = None) -> dict[str, Any]:
+        """
+        Constructor arguments of a role's network.
+
+        :param role: one of ``ROLES``
+        :param shared: the learner's encoder, if this role is to use it; without it the role gets one of its own
+        """
+        features_extractor, rest_extractor = shared, None
+        if shared is None:
+            features_extractor = self._make_extractor(self.role_keys[role])
+        else:
+            rest_extractor = self._make_extractor(self._keys_beside_the_learners(role))
+        extractors = [extractor for extractor in (features_extractor, rest_extractor) if extractor is not None]
         return {
-            "observation_space": space,
+            "observation_space": role_space(self.observation_space, self.role_keys[role]),  # type: ignore[arg-type]
             "action_space": self.action_space,
             "net_arch": self._net_arch[role],
             "features_extractor": features_extractor,
-            "features_dim": features_extractor.features_dim,
+            "rest_extractor": rest_extractor,
+            "features_dim": sum(extractor.features_dim for extractor in extractors),
             "activation_fn": self.constructor_options["activation_fn"],
             "normalize_images": self.normalize_images,
         }
 
-    def _make_critic_and_target(self, role: str, n_critics: int) -> tuple[CriticEnsemble, CriticEnsemble]:
-        critic = CriticEnsemble(**self._role_kwargs(role), n_critics=n_critics)
-        target = CriticEnsemble(**self._role_kwargs(role), n_critics=n_critics)
+    def _make_extractor(self, keys: Sequence[str]) -> BaseFeaturesExtractor:
+        space = role_space(self.observation_space, keys)  # type: ignore[arg-type]
+        return self.features_extractor_class(space, **self.features_extractor_kwargs)
+
+    def _keys_beside_the_learners(self, role: str) -> list[str]:
+        keys = [key for key in self.role_keys[role] if key not in self.role_keys["learner"]]
+        if not keys or not set(self.role_keys["learner"]) < set(self.role_keys[role]):
+            raise ValueError(
+                f"share_features_extractor=True needs a {role} that reads all of the learner's entries "
+                f"{list(self.role_keys['learner'])} and others, but it reads {list(self.role_keys[role])}."
+            )
+        return keys
+
+    def _make_critic_and_target(
+        self, role: str, n_critics: int, shared: BaseFeaturesExtractor | None
+    ) -> tuple[CriticEnsemble, CriticEnsemble]:
+        critic = CriticEnsemble(**self._role_kwargs(role, shared), n_critics=n_critics)
+        target = CriticEnsemble(**self._role_kwargs(role, deepcopy(shared)), n_critics=n_critics)
         target.load_state_dict(critic.state_dict())
         target.set_training_mode(False)
         return critic, target
@@ -311,14 +168,16 @@ class GACPolicy(BasePolicy):
         self._critic_parameters: list[th.Tensor] = [p for critic in critics for p in critic.parameters()]
         self._target_parameters: list[th.Tensor] = [p for target in targets for p in target.parameters()]
         self._has_statistics = any(get_parameters_by_name(critic, ["running_"]) for critic in critics)
-        self.network_parameters: dict[str, list[nn.Parameter]] = {
-            "guider": trainable(self.guider.parameters()),
-            "learner": trainable(self.learner.mean_parameters()),
-            "learner_log_std": trainable(self.learner.log_std.parameters()),
-            "guider_critic": trainable(self.guider_critic.parameters()),
-        }
+        learner_parameters = self.learner.mean_parameters()
+        networks: dict[str, nn.Module] = {"guider": self.guider, "guider_critic": self.guider_critic}
         if self.learner_critic is not None:
-            self.network_parameters["learner_critic"] = trainable(self.learner_critic.parameters())
+            networks["learner_critic"] = self.learner_critic
+        self.network_parameters: dict[str, list[nn.Parameter]] = {
+            "learner": trainable(learner_parameters),
+            "learner_log_std": trainable(self.learner.log_std.parameters()),
+            # A shared encoder is the learner's, whoever else holds it
+            **{name: trainable(net.parameters(), but=learner_parameters) for name, net in networks.items()},
+        }
         names = ("guider", "learner", "learner_log_std")
         self.actor_parameters = [p for name in names for p in self.network_parameters[name]]
 
@@ -448,6 +307,7 @@ class GACPolicy(BasePolicy):
                 "optimizer_kwargs": self.optimizer_kwargs,
                 "features_extractor_class": self.features_extractor_class,
                 "features_extractor_kwargs": self.features_extractor_kwargs,
+                "share_features_extractor": self.share_features_extractor,
             }
         )
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.torch_layers import CombinedExtractor
 
 from sb3_gac import GAC, GACShare, GACWithoutQ
 from sb3_gac.common.distributions import TanhGaussian
@@ -146,3 +147,64 @@ def test_the_log_std_head_has_no_say_in_the_clipping_of_the_learner():
     names = {name for name, p in model.policy.learner.named_parameters() if id(p) in head}
     assert names == {"log_std.weight", "log_std.bias"}
     assert head.isdisjoint(id(p) for p in model.policy.learner.mean_parameters())
+
+
+class TestSharedEncoder:
+    """With ``share_features_extractor`` the learner's loss alone trains the encoder that all look through."""
+
+    @pytest.fixture
+    def model(self):
+        class Encoder(CombinedExtractor):
+            """Has parameters even for vectors."""
+
+            def __init__(self, observation_space):
+                super().__init__(observation_space)
+                self.linear = th.nn.Linear(self.features_dim, self.features_dim)
+
+            def forward(self, observations):
+                return self.linear(super().forward(observations))
+
+        kwargs = {"net_arch": [16], "share_features_extractor": True, "features_extractor_class": Encoder}
+        model = small_model(learning_starts=1000, policy_kwargs=kwargs)
+        model.learn(64)
+        return model
+
+    def test_is_one_object(self, model):
+        shared = model.policy.learner.features_extractor
+        for part in (model.policy.guider, model.policy.guider_critic, model.policy.learner_critic):
+            assert part.features_extractor is shared
+        assert model.policy.learner_critic_target.features_extractor is not shared
+
+    def test_critics_leave_it_and_the_learner_trains_it(self, model):
+        batch = model._sample_batch(32)
+        encoder = model.policy.learner.features_extractor.linear.weight
+        before = encoder.detach().clone()
+        model._update_critics(batch)
+        assert th.equal(encoder, before)
+        guider = model.policy.distributions(batch.observations)[0]
+        assert "learner" not in _reached(model.policy, guider.mean.sum() + guider.log_std.sum())
+        model._update_policies(batch.observations)
+        assert not th.equal(encoder, before)
+
+    def test_is_optimised_once_and_followed_by_the_targets(self, model):
+        optimised = [id(p) for group in model.policy.actor_optimizer.param_groups for p in group["params"]]
+        assert len(optimised) == len(set(optimised))
+        of_critics = {id(p) for group in model.policy.critic_optimizer.param_groups for p in group["params"]}
+        assert of_critics.isdisjoint(optimised)
+        model._update_policies(model._sample_batch(32).observations)
+        model.policy.update_targets(1.0)
+        critic, target = model.policy.critic_pairs[1]
+        assert all(th.equal(p, q) for p, q in zip(critic.parameters(), target.parameters(), strict=True))
+
+    def test_saves_and_loads(self, model, tmp_path):
+        model.save(tmp_path / "model")
+        loaded = GAC.load(tmp_path / "model")
+        assert loaded.policy.guider.features_extractor is loaded.policy.learner.features_extractor
+        obs = {"partial": np.ones(2, np.float32)}
+        np.testing.assert_array_equal(*(m.predict(obs, deterministic=True)[0] for m in (model, loaded)))
+
+
+def test_shared_encoder_needs_a_privileged_view():
+    kwargs = {"share_features_extractor": True}
+    with pytest.raises(ValueError, match="share_features_extractor=True needs a guider_critic"):
+        small_model(role_keys={"guider_critic": ["partial"]}, policy_kwargs=kwargs)
