@@ -85,12 +85,6 @@ class RandomEnv(gym.Env):
 
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
-IMAGE = spaces.Box(0, 255, (1, 36, 36), np.uint8)
-MIXED_ENTRIES = {
-    PARTIAL: IMAGE,
-    PRIVILEGED: spaces.Box(-1, 1, (2,), np.float32),
-    "phase": spaces.Discrete(4),
-}
 
 
 def pendulum(max_episode_steps: int = 200) -> gym.Env:

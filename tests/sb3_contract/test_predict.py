@@ -6,6 +6,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import get_device
 
 from sb3_gac import GAC
@@ -36,9 +37,19 @@ def test_subclassed_spaces():
 def test_environment_is_wrapped_by_itself():
     model = GAC("MultiInputPolicy", pendulum(), policy_kwargs={"net_arch": [16]}).learn(110)
     assert model.get_env().num_envs == 1
+    assert model.get_env().env_is_wrapped(Monitor) == [True]
     assert len(model.ep_info_buffer) == 0
     model.learn(200)
     assert len(model.ep_info_buffer) == 1
+
+
+def test_environment_is_made_from_its_id():
+    gym.register("sb3_contract/Pendulum-v0", pendulum)
+    try:
+        model = GAC("MultiInputPolicy", "sb3_contract/Pendulum-v0", learning_starts=10, policy_kwargs={"net_arch": [16]})
+        assert model.learn(20).get_env().env_is_wrapped(Monitor) == [True]
+    finally:
+        del gym.registry["sb3_contract/Pendulum-v0"]
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda", "auto"])
@@ -49,7 +60,8 @@ def test_shapes_of_actions(device, deterministic):
     env = pendulum()
     obs, _ = env.reset()
     batch = vectorized(pendulum, 3).reset()
-    for single, batched in ((obs, batch), ({PARTIAL: obs[PARTIAL]}, {PARTIAL: batch[PARTIAL]}), (obs[PARTIAL], batch[PARTIAL])):
+    forms = (lambda full: full, lambda full: {PARTIAL: full[PARTIAL]}, lambda full: full[PARTIAL])
+    for single, batched in ((form(obs), form(batch)) for form in forms):
         action, state = model.predict(single, deterministic=deterministic)
         assert isinstance(action, np.ndarray)
         assert env.action_space.contains(action)
@@ -76,6 +88,7 @@ def test_guider_needs_the_privileged_entry_and_uses_it():
     obs, _ = pendulum().reset()
     action, _ = model.predict_guider(obs, deterministic=True)
     assert pendulum().action_space.contains(action)
+    np.testing.assert_array_equal(action, model.predict_guider({**obs, "unknown": 0}, deterministic=True)[0])
     moved = {**obs, PRIVILEGED: obs[PRIVILEGED] + 5}
     assert not np.array_equal(action, model.predict_guider(moved, deterministic=True)[0])
     batch = vectorized(pendulum, 3).reset()

@@ -9,7 +9,6 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
-from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_gac import GAC, GACShare, GACWithoutQ
 from tests.sb3_contract.helpers import make_gac, pendulum
@@ -112,14 +111,6 @@ def test_action_noise_is_vectorized_for_several_environments():
     assert isinstance(model.action_noise, VectorizedActionNoise)
     assert model.action_noise.n_envs == 2
     assert model.num_timesteps == 100
-
-
-def test_subprocess_environments():
-    env = make_vec_env(pendulum, n_envs=2, vec_env_cls=SubprocVecEnv)
-    model = make_gac(env, train_freq=5).learn(60)
-    env.close()
-    assert model._n_updates > 0
-    assert _is_finite(model)
 
 
 @pytest.mark.parametrize("interval", [1, 5])

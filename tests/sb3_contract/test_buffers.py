@@ -1,0 +1,68 @@
+"""SB3's contract: which replay buffers are accepted, and what they hold."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.buffers import DictReplayBuffer
+
+from tests.sb3_contract.helpers import make_gac, pendulum, vectorized
+
+
+class OwnBuffer(DictReplayBuffer):
+    """A buffer with an argument of its own that counts its samples and discounts them all by a half."""
+
+    def __init__(self, *args, scale=1.0, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.scale = scale
+        self.n_samples = 0
+
+    def sample(self, batch_size, env=None):
+        self.n_samples += batch_size
+        return super().sample(batch_size, env)._replace(discounts=th.full((batch_size, 1), 0.5))
+
+
+def test_default_buffer():
+    model = make_gac(vectorized(pendulum, 2), buffer_size=50)
+    assert type(model.replay_buffer) is DictReplayBuffer
+    assert model.replay_buffer.buffer_size == 25
+    model.learn(80)
+    assert model.replay_buffer.full
+
+
+def test_buffer_of_ones_own_is_sampled():
+    model = make_gac(replay_buffer_class=OwnBuffer, replay_buffer_kwargs={"scale": 2.0}, batch_size=7).learn(30)
+    assert model.replay_buffer.scale == 2.0
+    assert model.replay_buffer.n_samples == 7 * model._n_updates > 0
+    assert model._sample_batch(7).discounts.tolist() == [0.5] * 7
+
+
+def test_unknown_buffer_arguments_are_refused():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'wrong_keyword'"):
+        make_gac(replay_buffer_kwargs={"wrong_keyword": 1})
+
+
+@pytest.mark.parametrize("handle_timeouts", [True, False])
+def test_time_limits_are_not_terminations(handle_timeouts):
+    env = gym.wrappers.TimeLimit(pendulum(), 10)
+    kwargs = {"handle_timeout_termination": handle_timeouts}
+    model = make_gac(env, learning_starts=100, batch_size=200, replay_buffer_kwargs=kwargs).learn(50)
+    assert model.replay_buffer.dones[:50].sum() == 5
+    assert (model._sample_batch(200).dones.sum() == 0) == handle_timeouts
+
+
+class _Recorder(gym.Wrapper):
+    """Keep the actions that the environment was given."""
+
+    def step(self, action):
+        self.actions = [*getattr(self, "actions", []), action]
+        return super().step(action)
+
+
+def test_stored_transitions_chain_and_actions_are_scaled():
+    env = _Recorder(pendulum())
+    buffer = make_gac(env, learning_starts=10, buffer_size=100).learn(60).replay_buffer
+    for key, value in buffer.observations.items():
+        np.testing.assert_array_equal(value[1:60], buffer.next_observations[key][:59])
+    assert np.abs(buffer.actions[:60]).max() <= 1
+    np.testing.assert_allclose(env.actions, 2 * buffer.actions[:60, 0], rtol=1e-5)

@@ -1,0 +1,117 @@
+"""SB3's contract: network sizes, activations, optimisers, features extractors and policy classes of one's own."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_gac import GAC, GACPolicy
+from tests.sb3_contract.helpers import make_gac, pendulum
+
+
+def _hidden_sizes(network):
+    """Output sizes of the weights before the heads."""
+    layers = network.latent_net if hasattr(network, "latent_net") else network.q_networks[:-1]
+    return [layer.weight.shape[0 if isinstance(layer, nn.Linear) else -1] for layer in layers if hasattr(layer, "weight")]
+
+
+@pytest.mark.parametrize(
+    ("net_arch", "policy_sizes", "critic_sizes"),
+    [
+        ([], [], []),
+        ([4], [4], [4]),
+        ([4, 6], [4, 6], [4, 6]),
+        ({"pi": [8, 4], "qf": [6]}, [8, 4], [6]),
+        ({"pi": [], "qf": [6, 3]}, [], [6, 3]),
+    ],
+)
+def test_net_arch(net_arch, policy_sizes, critic_sizes):
+    model = make_gac(policy_kwargs={"net_arch": net_arch}, train_freq=2).learn(40)
+    assert model._n_updates > 0
+    for network in (model.policy.learner, model.policy.guider):
+        assert _hidden_sizes(network) == policy_sizes
+    for critic, target in model.policy.critic_pairs:
+        assert _hidden_sizes(critic) == _hidden_sizes(target) == critic_sizes
+
+
+@pytest.mark.parametrize("net_arch", [{"pi": [8]}, {"vf": [8], "pi": [8]}])
+def test_unknown_net_arch_is_refused(net_arch):
+    with pytest.raises(ValueError, match="net_arch"):
+        make_gac(policy_kwargs={"net_arch": net_arch})
+
+
+@pytest.mark.parametrize(
+    ("optimizer_class", "optimizer_kwargs"),
+    [
+        (th.optim.AdamW, None),
+        (th.optim.AdamW, {"weight_decay": 0.0}),
+        (th.optim.Adam, {"foreach": True}),
+        (th.optim.SGD, {"momentum": 0.9}),
+        (RMSpropTFLike, None),
+    ],
+)
+def test_optimizer(tmp_path, optimizer_class, optimizer_kwargs):
+    policy_kwargs = {"optimizer_class": optimizer_class, "optimizer_kwargs": optimizer_kwargs}
+    model = make_gac(policy_kwargs=policy_kwargs, train_freq=2).learn(40)
+    model.save(tmp_path / "model")
+    for one in (model, GAC.load(tmp_path / "model")):
+        for optimizer in (one.policy.actor_optimizer, one.policy.critic_optimizer):
+            assert type(optimizer) is optimizer_class
+            for name, value in (optimizer_kwargs or {}).items():
+                assert optimizer.param_groups[0][name] == value
+
+
+def test_every_parameter_but_the_targets_has_one_optimizer():
+    policy = make_gac().policy
+    optimizers = (policy.actor_optimizer, policy.critic_optimizer)
+    optimized = [parameter for optimizer in optimizers for parameter in optimizer.param_groups[0]["params"]]
+    targets = {id(parameter) for _, target in policy.critic_pairs for parameter in target.parameters()}
+    assert len(optimized) == len({id(parameter) for parameter in optimized})
+    assert {id(parameter) for parameter in policy.parameters()} - targets == {id(parameter) for parameter in optimized}
+
+
+def test_activation_function():
+    model = make_gac(policy_kwargs={"activation_fn": nn.Tanh}).learn(30)
+    for network in (model.policy.learner.latent_net, model.policy.guider.latent_net, model.critic.q_networks):
+        assert any(isinstance(layer, nn.Tanh) for layer in network)
+        assert not any(isinstance(layer, nn.SiLU) for layer in network)
+
+
+class Scaled(BaseFeaturesExtractor):
+    """A linear layer on all entries."""
+
+    def __init__(self, observation_space: spaces.Dict, features_dim: int = 3):
+        super().__init__(observation_space, features_dim)
+        self.linear = nn.Linear(get_flattened_obs_dim(observation_space), features_dim)
+
+    def forward(self, observations):
+        return self.linear(th.cat(list(observations.values()), dim=1))
+
+
+def test_features_extractor_is_made_on_the_entries_of_each_role():
+    policy_kwargs = {"features_extractor_class": Scaled, "features_extractor_kwargs": {"features_dim": 5}}
+    model = make_gac(policy_kwargs=policy_kwargs)
+    roles = {"learner": 2, "guider": 3, "guider_critic": 3, "learner_critic": 3}
+    before = {role: getattr(model.policy, role).features_extractor.linear.weight.clone() for role in roles}
+    model.learn(40)
+    for role, n_inputs in roles.items():
+        weight = getattr(model.policy, role).features_extractor.linear.weight
+        assert weight.shape == (5, n_inputs)
+        assert not th.allclose(before[role], weight), role
+
+
+class OwnPolicy(GACPolicy):
+    """A policy class of one's own."""
+
+
+def test_policy_class_of_ones_own(tmp_path):
+    model = GAC(OwnPolicy, pendulum(), learning_starts=10, policy_kwargs={"net_arch": [8]}).learn(20)
+    model.save(tmp_path / "model")
+    loaded = GAC.load(tmp_path / "model")
+    assert type(loaded.policy) is OwnPolicy
+    obs, _ = pendulum().reset()
+    np.testing.assert_array_equal(*(one.predict(obs, deterministic=True)[0] for one in (model, loaded)))
