@@ -6,7 +6,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -128,6 +128,11 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
                 "Wrap the environment so that its actions are continuous."
             )
         resolve_role_keys(self.observation_space, self.role_keys)
+        if self.replay_buffer_class in (ReplayBuffer, NStepReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class={self.replay_buffer_class.__name__} can't hold Dict observations: "
+                "leave it out, or give DictReplayBuffer or a subclass."
+            )
         check_positive("target_update_interval", self.target_update_interval)
         if self.max_grad_norm is not None:
             check_positive("max_grad_norm", self.max_grad_norm, remedy="or None for no clipping")

@@ -92,7 +92,8 @@ class GACPolicy(BasePolicy):
         }
         self.role_keys = resolve_role_keys(observation_space, role_keys)
         self.share_features_extractor = share_features_extractor
-        self._net_arch = resolve_net_arch(net_arch)
+        self.net_arch = net_arch
+        self._role_net_arch = resolve_net_arch(net_arch)
         self._build_networks(GUIDERS[guider], max_kl, kl_reduction, learner_critics, log_std_bounds, n_critics)
         self._collect_parameters()
         self._build_optimizers(lr_schedule)
@@ -132,7 +133,7 @@ class GACPolicy(BasePolicy):
         return {
             "observation_space": role_space(self.observation_space, self.role_keys[role]),  # type: ignore[arg-type]
             "action_space": self.action_space,
-            "net_arch": self._net_arch[role],
+            "net_arch": self._role_net_arch[role],
             "features_extractor": features_extractor,
             "rest_extractor": rest_extractor,
             "features_dim": sum(extractor.features_dim for extractor in extractors),
@@ -189,6 +190,9 @@ class GACPolicy(BasePolicy):
         critics = [p for name, group in self.network_parameters.items() if name.endswith("critic") for p in group]
         self.actor_optimizer = self.optimizer_class(self.actor_parameters, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
         self.critic_optimizer = self.optimizer_class(critics, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+        # Where SB3's SAC has them
+        self.actor.optimizer = self.actor_optimizer  # type: ignore[assignment]
+        self.critic.optimizer = self.critic_optimizer  # type: ignore[assignment]
 
     @property
     def actor(self) -> Learner:

@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -91,6 +92,7 @@ def test_policy_names(policy):
         ({"kl_reduction": "max"}, r"kl_reduction must be one of \['mean', 'sum'\]"),
         ({"guider": "teacher"}, r"guider must be one of \['independent', 'residual'\]"),
         ({"target_entropy": "high"}, 'target_entropy must be "auto", "sac" or a number'),
+        ({"replay_buffer_class": ReplayBuffer}, "replay_buffer_class=ReplayBuffer can't hold Dict"),
         ({"target_update_interval": 0}, "target_update_interval must be"),
         ({"role_keys": {"student": ["partial"]}}, r"unknown roles \['student'\]"),
         ({"role_keys": {"learner": ["touch"]}}, r'role_keys\["learner"\] names unknown.*touch'),

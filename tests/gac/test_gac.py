@@ -261,3 +261,10 @@ def test_target_entropy_conventions():
     assert small_model().target_entropy == -0.5
     assert small_model(target_entropy="sac").target_entropy == -1.0
     assert small_model(target_entropy=-2).target_entropy == -2.0
+
+
+def test_optimizers_are_where_sac_has_them():
+    model = small_model()
+    assert model.actor.optimizer is model.policy.actor_optimizer
+    assert model.critic.optimizer is model.policy.critic_optimizer
+    assert model.policy.net_arch == [16]
