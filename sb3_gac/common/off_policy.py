@@ -12,6 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs
 
+from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.checks import (
     UnsupportedActionSpaceError,
     check_finite_observation,
@@ -110,12 +111,17 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_arguments()
-        user_policy_kwargs = self.policy_kwargs
-        self.policy_kwargs = {**self._policy_options(), **user_policy_kwargs}
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = CompactDictReplayBuffer
+        as_given = {name: getattr(self, name) for name in ("policy_kwargs", "replay_buffer_kwargs", "n_steps")}
+        self.policy_kwargs = {**self._policy_options(), **self.policy_kwargs}
+        if issubclass(self.replay_buffer_class, CompactDictReplayBuffer):
+            self.replay_buffer_kwargs = {"n_steps": self.n_steps, "gamma": self.gamma, **self.replay_buffer_kwargs}
+            self.n_steps = 1  # SB3 warns that it can't pass n_steps on to this buffer: it just was
         try:
             super()._setup_model()
         finally:
-            self.policy_kwargs = user_policy_kwargs  # saved as the user gave them
+            self.__dict__.update(as_given)  # saved as the user gave them
         self._setup_coefficients()
 
     def _check_arguments(self) -> None:

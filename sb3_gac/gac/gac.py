@@ -48,10 +48,10 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     :param train_freq: steps, or (n, "step" | "episode"), between two rounds of training
     :param gradient_steps: gradient steps per round; -1 for as many as there were environment steps
     :param action_noise: added to the guider's actions
-    :param replay_buffer_class: default ``DictReplayBuffer``
+    :param replay_buffer_class: default :class:`CompactDictReplayBuffer`, which stores each observation once
     :param replay_buffer_kwargs: keyword arguments for it
-    :param optimize_memory_usage: of the replay buffer, see SB3
-    :param n_steps: of n-step returns, see SB3
+    :param optimize_memory_usage: of other replay buffers, see SB3
+    :param n_steps: rewards summed up in a critic's target before it bootstraps
     :param ent_coef: entropy temperature beta: "auto", "auto_<start value>" or a number
     :param target_update_interval: gradient steps between two updates of the targets
     :param target_entropy: "auto" for -0.5 per action dimension (the paper's), "sac" for -1 per dimension, or a number

@@ -191,8 +191,8 @@ class GACPolicy(BasePolicy):
         self.actor_optimizer = self.optimizer_class(self.actor_parameters, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
         self.critic_optimizer = self.optimizer_class(critics, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
         # Where SB3's SAC has them
-        self.actor.optimizer = self.actor_optimizer  # type: ignore[assignment]
-        self.critic.optimizer = self.critic_optimizer  # type: ignore[assignment]
+        self.actor.optimizer = self.actor_optimizer
+        self.critic.optimizer = self.critic_optimizer
 
     @property
     def actor(self) -> Learner:
