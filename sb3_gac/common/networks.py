@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
@@ -21,6 +22,30 @@ def trainable(parameters: Iterable[nn.Parameter], but: Iterable[nn.Parameter] = 
     """
     others = {id(parameter) for parameter in but}
     return [parameter for parameter in parameters if parameter.requires_grad and id(parameter) not in others]
+
+
+class VectorExtractor(BaseFeaturesExtractor):
+    """
+    What SB3's ``CombinedExtractor`` does to vectors, at a tenth of the cost: joins them, in the space's order.
+
+    :param observation_space: entries that are all one-dimensional Boxes of float32, which no preprocessing changes
+    """
+
+    def __init__(self, observation_space: spaces.Dict):
+        super().__init__(observation_space, sum(spaces.flatdim(box) for box in observation_space.values()))
+        self._keys = list(observation_space.spaces)
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        """
+        :param observations: at least these entries, (B, ...) each
+        :return: shape (B, F)
+        """
+        return th.cat([observations[key].float() for key in self._keys], dim=-1)
+
+    @staticmethod
+    def fits(space: spaces.Dict) -> bool:
+        """Whether all entries are such vectors."""
+        return all(isinstance(box, spaces.Box) and len(box.shape) == 1 and box.dtype == np.float32 for box in space.values())
 
 
 def polyak_average(parameters: list[th.Tensor], targets: list[th.Tensor], tau: float) -> None:
@@ -59,6 +84,8 @@ class RoleModel(BaseModel):
 
     def _encode(self, obs: PyTorchObs, space: spaces.Space, extractor: BaseFeaturesExtractor) -> th.Tensor:
         assert isinstance(space, spaces.Dict)
+        if isinstance(extractor, VectorExtractor):
+            return extractor(obs)
         entries = {key: obs[key] for key in space.spaces}  # type: ignore[index]
         return extractor(preprocess_obs(entries, space, normalize_images=self.normalize_images))
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_gac.common.distributions import TanhGaussian
-from sb3_gac.common.networks import CriticEnsemble, polyak_average, trainable
+from sb3_gac.common.networks import CriticEnsemble, VectorExtractor, polyak_average, trainable
 from sb3_gac.common.roles import RoleKeys, resolve_net_arch, resolve_role_keys, role_space
 from sb3_gac.gac.actors import GUIDERS, LOG_STD_BOUNDS, Guider, Learner
 
@@ -143,6 +143,8 @@ class GACPolicy(BasePolicy):
 
     def _make_extractor(self, keys: Sequence[str]) -> BaseFeaturesExtractor:
         space = role_space(self.observation_space, keys)  # type: ignore[arg-type]
+        if self.features_extractor_class is CombinedExtractor and VectorExtractor.fits(space):
+            return VectorExtractor(space)
         return self.features_extractor_class(space, **self.features_extractor_kwargs)
 
     def _keys_beside_the_learners(self, role: str) -> list[str]:
