@@ -66,17 +66,27 @@ def guided_target(
     return reward + discount * (1 - done) * next_value
 
 
-def learner_target(reward: th.Tensor, done: th.Tensor, next_q: th.Tensor, discount: th.Tensor | float) -> th.Tensor:
+def learner_target(
+    reward: th.Tensor,
+    done: th.Tensor,
+    next_q: th.Tensor,
+    discount: th.Tensor | float,
+    next_log_prob: th.Tensor | float = 0.0,
+    ent_coef: th.Tensor | float = 0.0,
+) -> th.Tensor:
     """
-    Bellman target of the learner critics (eq. 15): the plain return, neither KL nor entropy.
+    Bellman target of the learner critics (eq. 15): the plain return, without KL; with SAC's entropy term on request.
 
     :param reward: shape (\\*E)
     :param done: 1 where the episode terminated, shape (\\*E)
     :param next_q: target critics at (s', a'), a' from the learner, shape (N, \\*E)
     :param discount: scalar or (\\*E)
+    :param next_log_prob: log pi(a'|o'), shape (\\*E)
+    :param ent_coef: beta, or 0 for the equation as printed
     :return: shape (\\*E)
     """
-    return reward + discount * (1 - done) * next_q.amin(dim=0)
+    next_value = next_q.amin(dim=0) - ent_coef * next_log_prob
+    return reward + discount * (1 - done) * next_value
 
 
 def critic_loss(q: th.Tensor, target: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
@@ -113,17 +123,26 @@ def guider_loss(
     return masked_mean(kl_coef * kl + ent_coef * log_prob - q.amin(dim=0), mask)
 
 
-def learner_loss(kl: th.Tensor, q: th.Tensor, kl_coef: th.Tensor | float, mask: th.Tensor | None = None) -> th.Tensor:
+def learner_loss(
+    kl: th.Tensor,
+    q: th.Tensor,
+    kl_coef: th.Tensor | float,
+    log_prob: th.Tensor | float = 0.0,
+    ent_coef: th.Tensor | float = 0.0,
+    mask: th.Tensor | None = None,
+) -> th.Tensor:
     """
-    Learner objective (eq. 16): follow the guider, and climb the learner's own critics.
+    Learner objective (eq. 16): follow the guider, climb the learner's own critics; with SAC's entropy term on request.
 
     :param kl: KL(sg mu || pi), shape (\\*E)
     :param q: critics at (s, a), a from the learner and reparameterised, frozen, shape (N, \\*E)
     :param kl_coef: alpha
+    :param log_prob: log pi(a|o) under the borrowed std, shape (\\*E)
+    :param ent_coef: beta, or 0 for the equation as printed
     :param mask: shape (\\*E)
     :return: scalar
     """
-    return masked_mean(kl_coef * kl - q.amin(dim=0), mask)
+    return masked_mean(kl_coef * kl + ent_coef * log_prob - q.amin(dim=0), mask)
 
 
 def distillation_loss(kl: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:

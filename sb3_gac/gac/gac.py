@@ -62,6 +62,8 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
     :param guider: "residual": learner plus a privileged correction; "independent": a network of its own (the paper's)
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
+    :param learner_entropy: SAC's entropy term in the learner's objective and critics, without which its mean drifts
+        into saturation; False for eqs. 15 and 16 as printed
     :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
     :param role_keys: role -> observation entries, by default ``partial`` for the learner and all for the others
     :param stats_window_size: episodes averaged in rollout statistics
@@ -103,6 +105,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         kl_reduction: str = "mean",
         guider: str = "residual",
         max_kl: float | None = None,
+        learner_entropy: bool = True,
         max_grad_norm: float | None = 1.0,
         role_keys: RoleKeys | None = None,
         stats_window_size: int = 100,
@@ -148,6 +151,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         self.kl_reduction = kl_reduction
         self.guider = guider
         self.max_kl = max_kl
+        self.learner_entropy = learner_entropy
         if _init_setup_model:
             self._setup_model()
 
@@ -226,8 +230,11 @@ class GAC(AsymmetricOffPolicyAlgorithm):
             )
         }
         if self.policy.learner_critic_target is not None:
-            next_q = self.policy.learner_critic_target(batch.next_observations, learner.sample())
-            targets["learner_critic"] = learner_target(batch.rewards, batch.dones, next_q, batch.discounts)
+            next_action, next_log_prob = learner.sample_with_log_prob()
+            next_q = self.policy.learner_critic_target(batch.next_observations, next_action)
+            targets["learner_critic"] = learner_target(
+                batch.rewards, batch.dones, next_q, batch.discounts, next_log_prob, self._learner_ent_coef
+            )
         return targets
 
     def _update_policies(self, obs: PyTorchObs) -> tuple[Metrics, th.Tensor, th.Tensor]:
@@ -269,7 +276,13 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         :param kl: KL(sg mu || pi), shape (B,)
         :return: scalar
         """
-        return learner_loss(kl, self.policy.critic(obs, learner.sample()), self.kl_coef_dual.value)
+        action, log_prob = learner.sample_with_log_prob()
+        q = self.policy.critic(obs, action)
+        return learner_loss(kl, q, self.kl_coef_dual.value, log_prob, self._learner_ent_coef)
+
+    @property
+    def _learner_ent_coef(self) -> th.Tensor | float:
+        return self.ent_coef_dual.value if self.learner_entropy else 0.0
 
     def _kl(self, guider_mean: th.Tensor, learner: TanhGaussian) -> th.Tensor:
         """KL(guider || learner) with the std that ``learner`` borrowed, shape (B,)."""

@@ -96,7 +96,7 @@ def _sequence_losses(mask, kl, log_prob, q, log_std):
     return [
         losses.critic_loss(q, kl, mask),
         losses.guider_loss(kl, log_prob, q, 0.7, 0.2, mask),
-        losses.learner_loss(kl, q, 0.7, mask),
+        losses.learner_loss(kl, q, 0.7, log_prob, 0.2, mask),
         losses.distillation_loss(kl, mask),
         losses.log_std_loss(log_std, th.zeros_like(log_std), mask),
         losses.dual_loss(th.zeros(1), kl, mask),
@@ -113,6 +113,7 @@ def test_padding_has_no_say():
     for poison in (1e9, math.nan, math.inf):
         kl[~valid] = poison
         q[:, ~valid] = poison
+        log_prob[~valid] = poison
         for actual, wanted in zip(_sequence_losses(mask, kl, log_prob, q, log_std), expected, strict=True):
             th.testing.assert_close(actual, wanted)
 
@@ -121,3 +122,11 @@ def test_padding_gets_no_gradient():
     kl = th.tensor([1.0, math.nan], requires_grad=True)
     losses.distillation_loss(kl, th.tensor([1.0, 0.0])).backward()
     assert kl.grad.tolist() == [1.0, 0.0]
+
+
+def test_entropy_terms_of_the_learner_by_hand():
+    q, log_prob = th.tensor([[2.0], [3.0]]), th.tensor([0.5])
+    # 1 + 0.9 * (2 - 0.2 * 0.5) = 2.71
+    assert losses.learner_target(th.ones(1), th.zeros(1), q, 0.9, log_prob, 0.2).item() == pytest.approx(2.71)
+    # 0.7 * 0.1 + 0.2 * 0.5 - 2 = -1.83
+    assert losses.learner_loss(th.tensor([0.1]), q, 0.7, log_prob, 0.2).item() == pytest.approx(-1.83)
