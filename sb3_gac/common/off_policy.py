@@ -1,6 +1,7 @@
 """What off-policy algorithms with a privileged view share: acting, the train loop, logging, checks and save lists."""
 
 from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from sb3_gac.common.checks import (
     check_terminal_observations,
 )
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
+from sb3_gac.common.parallel import halved_threads, run_halves
 from sb3_gac.common.roles import RoleKeys, resolve_role_keys
 
 ENT_COEF_START = 0.1
@@ -98,6 +100,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.target_update_interval = target_update_interval
         self.max_grad_norm = max_grad_norm
         self.role_keys = role_keys
+        self._halves_together = False
 
     # --- set-up -----------------------------------------------------------------------------------------------------
 
@@ -260,13 +263,27 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._scheduled_optimizers())
-        history: list[Metrics] = []
-        for _ in range(gradient_steps):
-            history.append(self._gradient_step(self._sample_batch(batch_size)))
-            self._n_updates += 1
-            if self._n_updates % self.target_update_interval == 0:
-                self.policy.update_targets(self.tau)  # type: ignore[operator]
+        self._halves_together = self.device.type == "cpu" and th.get_num_threads() > 1
+        with halved_threads(self._halves_together):
+            history = [self._one_update(batch_size) for _ in range(gradient_steps)]
         self._record_metrics(history)
+
+    def _one_update(self, batch_size: int) -> Metrics:
+        metrics = self._gradient_step(self._sample_batch(batch_size))
+        self._n_updates += 1
+        if self._n_updates % self.target_update_interval == 0:
+            self.policy.update_targets(self.tau)  # type: ignore[operator]
+        return metrics
+
+    def _run_halves(self, tasks: Sequence[Callable[[], Metrics]]) -> Metrics:
+        """
+        :param tasks: independent of each other, see :func:`run_halves`
+        :return: the metrics of all
+        """
+        metrics: Metrics = {}
+        for result in run_halves(tasks, self._halves_together):
+            metrics |= result
+        return metrics
 
     @abstractmethod
     def _gradient_step(self, batch: Batch) -> Metrics:

@@ -5,7 +5,6 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_gac.common.distributions import TanhGaussian
 from sb3_gac.common.losses import distillation_loss
 from sb3_gac.gac.gac import GAC
 
@@ -20,5 +19,5 @@ class GACShare(GAC):
 class GACWithoutQ(GACShare):
     """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14)."""
 
-    def _learner_loss(self, obs: PyTorchObs, learner: TanhGaussian, kl: th.Tensor) -> th.Tensor:
+    def _learner_loss(self, obs: PyTorchObs, kl: th.Tensor, action: th.Tensor, log_prob: th.Tensor) -> th.Tensor:
         return distillation_loss(kl)

@@ -1,6 +1,8 @@
 """Guided Actor-Critic."""
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -200,83 +202,94 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         return self.target_kl_schedule(self._current_progress_remaining)
 
     def _update_critics(self, batch: Batch) -> Metrics:
-        """Eqs. 12 and 15, all critics in one backward pass."""
-        losses: list[th.Tensor] = []
-        metrics: Metrics = {}
+        """Eqs. 12 and 15."""
         targets = self._critic_targets(batch)
-        for name, target in targets.items():
-            q = getattr(self.policy, name)(batch.observations, batch.actions)
-            losses.append(critic_loss(q, target))
-            metrics |= {f"{name}_loss": losses[-1].detach(), f"{name}_q": q.detach().mean()}
-        loss = th.stack(losses).sum()
         self.policy.critic_optimizer.zero_grad()
-        loss.backward()
-        for name in targets:
-            metrics[f"{name}_grad_norm"] = self._clip_gradients(name)
+        metrics = self._run_halves([partial(self._critic_gradients, *target, batch) for target in targets.items()])
         self.policy.critic_optimizer.step()
-        return metrics | {"critic_loss": loss.detach()}
+        return metrics | {"critic_loss": th.stack([metrics[f"{name}_loss"] for name in targets]).sum()}
 
-    @th.no_grad()
-    def _critic_targets(self, batch: Batch) -> dict[str, th.Tensor]:
-        """Critics -> their targets, each of shape (B,)."""
-        guider, learner, _ = self.policy.distributions(batch.next_observations)
-        next_action, next_log_prob = guider.sample_with_log_prob()
-        next_q = self.policy.guider_critic_target(batch.next_observations, next_action)
-        next_kl = self._kl(guider.mean, learner)
-        coefficients = (self.kl_coef_dual.value, self.ent_coef_dual.value)
-        targets = {
-            "guider_critic": guided_target(
-                batch.rewards, batch.dones, next_q, next_kl, next_log_prob, *coefficients, batch.discounts
+    def _critic_targets(self, batch: Batch) -> dict[str, Callable[[], th.Tensor]]:
+        """Critics -> what computes their targets, each of shape (B,); all random numbers are drawn here."""
+        critics, next_obs = self.policy, batch.next_observations
+        with th.no_grad():
+            guider, learner, _ = self.policy.distributions(next_obs)
+            next_kl = self._kl(guider.mean, learner)
+            guider_action, guider_log_prob = guider.sample_with_log_prob()
+            learner_action, learner_log_prob = learner.sample_with_log_prob()
+
+        def guided() -> th.Tensor:
+            next_q = critics.guider_critic_target(next_obs, guider_action)
+            coefficients = (self.kl_coef_dual.value, self.ent_coef_dual.value)
+            return guided_target(batch.rewards, batch.dones, next_q, next_kl, guider_log_prob, *coefficients, batch.discounts)
+
+        def of_learner() -> th.Tensor:
+            next_q = critics.critic_target(next_obs, learner_action)
+            return learner_target(
+                batch.rewards, batch.dones, next_q, batch.discounts, learner_log_prob, self._learner_ent_coef
             )
-        }
-        if self.policy.learner_critic_target is not None:
-            next_action, next_log_prob = learner.sample_with_log_prob()
-            next_q = self.policy.learner_critic_target(batch.next_observations, next_action)
-            targets["learner_critic"] = learner_target(
-                batch.rewards, batch.dones, next_q, batch.discounts, next_log_prob, self._learner_ent_coef
-            )
-        return targets
+
+        targets = {"guider_critic": guided, "learner_critic": of_learner}
+        return {name: target for name, target in targets.items() if name in self.policy.network_parameters}
+
+    def _critic_gradients(self, name: str, target: Callable[[], th.Tensor], batch: Batch) -> Metrics:
+        """Half of the critics' phase: one ensemble's clipped gradients."""
+        with th.no_grad():
+            y = target()
+        q = getattr(self.policy, name)(batch.observations, batch.actions)
+        loss = critic_loss(q, y)
+        loss.backward()
+        grad_norm = self._clip_gradients(name)
+        return {f"{name}_loss": loss.detach(), f"{name}_q": q.detach().mean(), f"{name}_grad_norm": grad_norm}
 
     def _update_policies(self, obs: PyTorchObs) -> tuple[Metrics, th.Tensor, th.Tensor]:
         """
-        Eqs. 13 and 16 in one backward pass: their gradients meet in no parameter.
+        Eqs. 13 and 16: the gradients of the two objectives meet in no parameter.
 
         :return: metrics; KL(guider || learner) and the guider's log-probability, detached, each of shape (B,)
         """
         guider, learner, deployment_log_std = self.policy.distributions(obs)
         action, log_prob = guider.sample_with_log_prob()
-        guider_kl = self._kl(guider.mean, TanhGaussian(learner.mean.detach(), learner.log_std))
-        q = self.policy.guider_critic(obs, action)
-        guider_objective = guider_loss(guider_kl, log_prob, q, self.kl_coef_dual.value, self.ent_coef_dual.value)
-        learner_objective = self._learner_loss(obs, learner, self._kl(guider.mean.detach(), learner))
-        deployment_loss = log_std_loss(deployment_log_std, learner.log_std)
-        loss = guider_objective + learner_objective + deployment_loss
+        learner_sample = learner.sample_with_log_prob()
+        kl = self._kl(guider.mean, TanhGaussian(learner.mean.detach(), learner.log_std))
+
+        def guider_objective() -> th.Tensor:
+            q = self.policy.guider_critic(obs, action)
+            return guider_loss(kl, log_prob, q, self.kl_coef_dual.value, self.ent_coef_dual.value)
+
+        def learner_objective() -> th.Tensor:
+            return self._learner_loss(obs, self._kl(guider.mean.detach(), learner), *learner_sample)
+
         self.policy.actor_optimizer.zero_grad()
-        loss.backward(inputs=self.policy.actor_parameters)  # the critics stay as they are
-        metrics = {
-            "guider_grad_norm": self._clip_gradients("guider"),
-            "learner_grad_norm": self._clip_gradients("learner"),
-        }
+        objectives = {"guider": guider_objective, "learner": learner_objective}
+        metrics = self._run_halves([partial(self._policy_gradients, *objective) for objective in objectives.items()])
+        deployment_loss = log_std_loss(deployment_log_std, learner.log_std)
+        deployment_loss.backward()
         self.policy.actor_optimizer.step()
         metrics |= {
-            "actor_loss": learner_objective.detach(),
-            "guider_loss": guider_objective.detach(),
+            "actor_loss": metrics["learner_loss"],
             "log_std_loss": deployment_loss.detach(),
             "std": learner.log_std.exp().mean(),
             "learner_mean_abs": learner.mean.detach().abs().mean(),
         }
-        return metrics, guider_kl.detach(), log_prob.detach()
+        return metrics, kl.detach(), log_prob.detach()
 
-    def _learner_loss(self, obs: PyTorchObs, learner: TanhGaussian, kl: th.Tensor) -> th.Tensor:
+    def _policy_gradients(self, name: str, objective: Callable[[], th.Tensor]) -> Metrics:
+        """Half of the policies' phase: one policy's clipped gradients; the critics stay as they are."""
+        loss = objective()
+        loss.backward(inputs=self.policy.network_parameters[name])
+        return {f"{name}_loss": loss.detach(), f"{name}_grad_norm": self._clip_gradients(name)}
+
+    def _learner_loss(self, obs: PyTorchObs, kl: th.Tensor, action: th.Tensor, log_prob: th.Tensor) -> th.Tensor:
         """
         Eq. 16, with the learner's critics, or the guided ones where it has none.
 
         :param obs: full observation, B of each entry
-        :param learner: its action distribution, shapes (B, A)
         :param kl: KL(sg mu || pi), shape (B,)
+        :param action: from the learner, reparameterised, shape (B, A)
+        :param log_prob: of that action, shape (B,)
         :return: scalar
         """
-        action, log_prob = learner.sample_with_log_prob()
         q = self.policy.critic(obs, action)
         return learner_loss(kl, q, self.kl_coef_dual.value, log_prob, self._learner_ent_coef)
 

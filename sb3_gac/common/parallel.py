@@ -1,0 +1,66 @@
+"""
+Two halves of a gradient step at once, on the CPU.
+
+The networks of this package are small: one matrix product of theirs does not fill two cores, but guider and learner, each
+with critics of its own, are independent of each other for most of a step.  A worker thread takes one half, the calling
+thread the other, each with half of torch's threads.  (Python's lock is free during every product.)  Results are those of
+the two halves one after the other.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
+from typing import TypeVar
+
+import torch as th
+
+T = TypeVar("T")
+
+
+@cache
+def _worker() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="sb3_gac")
+
+
+def _with_threads(task: Callable[[], T], threads: int) -> T:
+    """torch counts its threads per calling thread."""
+    if th.get_num_threads() != threads:
+        th.set_num_threads(threads)
+    return task()
+
+
+def run_halves(tasks: Sequence[Callable[[], T]], together: bool) -> list[T]:
+    """
+    :param tasks: one or two that share nothing that either changes; random numbers must be drawn before
+    :param together: whether to run them at once; an error in either is raised either way
+    :return: their results, in order
+    """
+    if not together or len(tasks) < 2:
+        return [task() for task in tasks]
+    first, second = tasks
+    future = _worker().submit(_with_threads, second, th.get_num_threads())
+    try:
+        result = first()
+    finally:
+        exception = future.exception()  # waits: the worker must not go on alone
+    if exception is not None:
+        raise exception
+    return [result, future.result()]
+
+
+@contextmanager
+def halved_threads(enabled: bool) -> Iterator[None]:
+    """
+    Leave half of torch's threads to the worker, for as long as the context lasts.
+
+    :param enabled: whether to
+    """
+    threads = th.get_num_threads()
+    if enabled:
+        th.set_num_threads(max(threads // 2, 1))
+    try:
+        yield
+    finally:
+        if enabled:
+            th.set_num_threads(threads)
