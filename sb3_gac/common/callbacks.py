@@ -24,9 +24,10 @@ class GuiderLearnerEvalCallback(EvalCallback):
     """
     Evaluate the learner, as ``EvalCallback`` does, and the guider on the same seeds (the paper's Figure 4).
 
-    Logs ``eval/mean_reward`` (learner) and ``eval/guider_mean_reward``, and keeps both in ``guider_evaluations.npz``
-    under ``log_path``.  Warns when the learner no longer follows the guider, that is, when ``patience`` evaluations in
-    a row find KL more than twice its target, the KL coefficient on a bound, or a guider that is clearly better.
+    Logs ``eval/mean_reward`` (learner) and ``eval/guider_mean_reward``, and keeps both, with the means of KL and its
+    coefficient since the last evaluation, in ``history`` and in ``guider_evaluations.npz`` under ``log_path``.  Warns
+    when the learner no longer follows the guider, that is, when ``patience`` evaluations in a row find KL more than
+    twice its target, the KL coefficient on a bound, or a guider that is clearly better.
 
     :param eval_env: environment for evaluation
     :param eval_seed: both policies are evaluated from these seeds, at every evaluation the same
@@ -51,18 +52,23 @@ class GuiderLearnerEvalCallback(EvalCallback):
         self.gap_tolerance = gap_tolerance
         self.history: list[dict[str, float]] = []
         self._directory = None if log_path is None else Path(log_path)
+        self._since_evaluation: dict[str, list[float]] = {}
         self._watched: dict[str, float] = {}
         self._in_a_row = {"kl": 0, "bound": 0, "gap": 0}
         self._episode_returns: list[float] = []
 
     def _on_rollout_start(self) -> None:
-        """Keep what the last gradient step logged: the logger forgets it at every dump."""
+        """Collect what the last gradient steps logged: the logger forgets it at every dump."""
         logged = self.logger.name_to_value
-        self._watched.update({name: logged[name] for name in _WATCHED if name in logged})
+        for name in _WATCHED:
+            if name in logged:
+                self._since_evaluation.setdefault(name, []).append(logged[name])
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
             return True
+        self._watched.update({name: float(np.mean(values)) for name, values in self._since_evaluation.items()})
+        self._since_evaluation.clear()
         guider_returns = self._evaluate_guider()
         self.eval_env.seed(self.eval_seed)
         self._episode_returns = []

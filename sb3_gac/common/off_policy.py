@@ -311,6 +311,13 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         optimizers = [self.policy.actor_optimizer, self.policy.critic_optimizer, self.ent_coef_optimizer]
         return [optimizer for optimizer in optimizers if optimizer is not None]  # type: ignore[misc]
 
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        """Follow the schedule; a parameter group's "lr_scale" multiplies it."""
+        super()._update_learning_rate(optimizers)
+        for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
+            for group in optimizer.param_groups:
+                group["lr"] *= group.get("lr_scale", 1.0)
+
     def _record_metrics(self, history: list[Metrics]) -> None:
         """Log means over the gradient steps of one ``train()``: the only host transfer there is."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

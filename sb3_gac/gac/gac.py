@@ -63,6 +63,8 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     :param kl_coef_learning_rate: of a learned ``kl_coef``
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
     :param guider: "residual": learner plus a privileged correction; "independent": a network of its own (the paper's)
+    :param guider_lr_scale: the guider's learning rate as a multiple of ``learning_rate``: it corrects a learner that
+        moves, and has to do so faster than that moves
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
     :param learner_entropy: SAC's entropy term in the learner's objective and critics, without which its mean drifts
         into saturation; False for eqs. 15 and 16 as printed
@@ -106,6 +108,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         kl_coef_learning_rate: float = 3e-3,
         kl_reduction: str = "mean",
         guider: str = "residual",
+        guider_lr_scale: float = 3.0,
         max_kl: float | None = None,
         learner_entropy: bool = True,
         max_grad_norm: float | None = 1.0,
@@ -152,6 +155,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         self.kl_coef_learning_rate = kl_coef_learning_rate
         self.kl_reduction = kl_reduction
         self.guider = guider
+        self.guider_lr_scale = guider_lr_scale
         self.max_kl = max_kl
         self.learner_entropy = learner_entropy
         if _init_setup_model:
@@ -164,6 +168,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         if not callable(self.target_kl):
             check_positive("target_kl", self.target_kl, remedy="for example the default 0.0033")
         check_positive("kl_coef_learning_rate", self.kl_coef_learning_rate)
+        check_positive("guider_lr_scale", self.guider_lr_scale)
         check_choice("kl_reduction", self.kl_reduction, KL_REDUCTIONS)
         check_choice("guider", self.guider, GUIDERS)
         if self.max_kl is not None:
@@ -172,6 +177,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     def _policy_options(self) -> dict[str, Any]:
         return super()._policy_options() | {
             "guider": self.guider,
+            "guider_lr_scale": self.guider_lr_scale,
             "max_kl": self.max_kl,
             "kl_reduction": self.kl_reduction,
         }

@@ -36,6 +36,7 @@ class GACPolicy(BasePolicy):
     :param log_std_bounds: smallest and largest log standard deviation before tanh
     :param features_extractor_class: encoder, made once per role on the entries of that role
     :param features_extractor_kwargs: keyword arguments for it
+    :param guider_lr_scale: learning rate of the guider, as a multiple of that of the others
     :param share_features_extractor: whether guider and critics see the learner's features of its entries, as they are,
         and encode only the other entries themselves; the learner's loss trains that encoder (saves most of the work
         where ``partial`` is an image)
@@ -60,6 +61,7 @@ class GACPolicy(BasePolicy):
         max_kl: float | None = None,
         kl_reduction: str = "mean",
         learner_critics: bool = True,
+        guider_lr_scale: float = 1.0,
         log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
         features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
@@ -87,6 +89,7 @@ class GACPolicy(BasePolicy):
             "max_kl": max_kl,
             "kl_reduction": kl_reduction,
             "learner_critics": learner_critics,
+            "guider_lr_scale": guider_lr_scale,
             "log_std_bounds": log_std_bounds,
             "n_critics": n_critics,
         }
@@ -181,8 +184,6 @@ class GACPolicy(BasePolicy):
             # A shared encoder is the learner's, whoever else holds it
             **{name: trainable(net.parameters(), but=learner_parameters) for name, net in networks.items()},
         }
-        names = ("guider", "learner", "learner_log_std")
-        self.actor_parameters = [p for name in names for p in self.network_parameters[name]]
 
     def _build_optimizers(self, lr_schedule: Schedule) -> None:
         """One optimiser for the two policies and one for all critics: their losses never share a parameter."""
@@ -190,7 +191,9 @@ class GACPolicy(BasePolicy):
         if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
             kwargs.setdefault("fused", True)
         critics = [p for name, group in self.network_parameters.items() if name.endswith("critic") for p in group]
-        self.actor_optimizer = self.optimizer_class(self.actor_parameters, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+        own = {"params": self.network_parameters["guider"], "lr_scale": self.constructor_options["guider_lr_scale"]}
+        others = {"params": [*self.network_parameters["learner"], *self.network_parameters["learner_log_std"]]}
+        self.actor_optimizer = self.optimizer_class([own, others], lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
         self.critic_optimizer = self.optimizer_class(critics, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
         # Where SB3's SAC has them
         self.actor.optimizer = self.actor_optimizer

@@ -294,3 +294,14 @@ def test_optimizers_are_where_sac_has_them():
     assert model.actor.optimizer is model.policy.actor_optimizer
     assert model.critic.optimizer is model.policy.critic_optimizer
     assert model.policy.net_arch == [16]
+
+
+def test_the_guider_learns_at_its_own_rate():
+    model = small_model(learning_rate=LinearSchedule(1e-3, 0.0, 1.0), guider_lr_scale=3.0)
+    model.learn(50)
+    rates = [group["lr"] for group in model.policy.actor_optimizer.param_groups]
+    assert rates[0] == pytest.approx(3 * rates[1])
+    assert rates[1] == pytest.approx(model.lr_schedule(model._current_progress_remaining))
+    assert rates[1] < 1e-3
+    guider = {id(p) for p in model.policy.guider.parameters()}
+    assert {id(p) for p in model.policy.actor_optimizer.param_groups[0]["params"]} == guider
