@@ -54,13 +54,13 @@ class TanhGaussian:
         return th.addcmul(self.mean, self.log_std.exp(), noise)
 
     def _log_prob(self, pre_tanh: th.Tensor, standardised: th.Tensor) -> th.Tensor:
-        log_density = -0.5 * standardised.square() - self.log_std - _LOG_SQRT_2PI
-        return (log_density - log_tanh_derivative(pre_tanh)).sum(dim=-1)
-
-
-def log_tanh_derivative(pre_tanh: th.Tensor) -> th.Tensor:
-    """log(1 - tanh(x)^2), without cancellation for large \\|x\\|; same shape as x."""
-    return 2.0 * (math.log(2.0) - pre_tanh - F.softplus(-2.0 * pre_tanh))
+        """
+        log N(x; mean, std) - log(1 - tanh(x)^2), summed over dimensions, the constants once at the end; with
+        log(1 - tanh(x)^2) = 2 (log 2 - x - log(1 + exp(-2 x))), which does not cancel for large |x|.
+        """
+        log_cosh = pre_tanh + F.softplus(pre_tanh * -2.0)  # but for a constant
+        summed = th.addcmul(th.sub(log_cosh, self.log_std, alpha=0.5), standardised, standardised, value=-0.25).sum(dim=-1)
+        return 2.0 * summed - pre_tanh.shape[-1] * (_LOG_SQRT_2PI + 2.0 * math.log(2.0))
 
 
 def kl_shared_std(guider_mean: th.Tensor, learner_mean: th.Tensor, std: th.Tensor, reduction: str = "mean") -> th.Tensor:

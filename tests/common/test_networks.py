@@ -12,41 +12,51 @@ from tests.helpers import small_model
 SPACE = spaces.Dict(b=spaces.Box(-1, 1, (3,), np.float32), a=spaces.Box(-np.inf, np.inf, (2,), np.float32))
 
 
-def _critics(n_critics=3):
+def _critics(net_arch, n_critics=3):
     extractor = VectorExtractor(SPACE)
-    actions = spaces.Box(-1, 1, (2,))
-    return CriticEnsemble(SPACE, actions, [8, 6], extractor, extractor.features_dim, n_critics=n_critics)
+    return CriticEnsemble(SPACE, spaces.Box(-1, 1, (2,)), net_arch, extractor, extractor.features_dim, n_critics=n_critics)
+
+
+def _linear(weight, bias):
+    """A plain torch layer from weights of shape (in, out)."""
+    layer = th.nn.Linear(*weight.shape)
+    layer.weight.data, layer.bias.data = weight.detach().T.clone(), bias.detach().clone()
+    return layer
 
 
 def _member(critics, index):
     """One Q-network as plain torch layers."""
     layers = []
-    for layer in critics.q_networks:
-        if isinstance(layer, EnsembleLinear):
-            plain = th.nn.Linear(*layer.weight.shape[1:])
-            plain.weight.data = layer.weight[index].detach().T.clone()
-            plain.bias.data = layer.bias[index, 0].detach().clone()
-            layers.append(plain)
-        else:
-            layers.append(layer)
-    return th.nn.Sequential(*layers)
+    if critics.input is not None:
+        weight = th.cat([critics.input.features_weight[index], critics.input.actions_weight[index]])
+        layers.append(_linear(weight, critics.input.bias[index, 0]))
+    for layer in critics.hidden:
+        is_linear = isinstance(layer, EnsembleLinear)
+        layers.append(_linear(layer.weight[index], layer.bias[index, 0]) if is_linear else layer)
+    return th.nn.Sequential(*layers, _linear(critics.output.weight[index].T, critics.output.bias[index]))
 
 
-def test_ensemble_is_so_many_separate_networks():
-    critics = _critics()
-    obs, actions = {"a": th.randn(5, 2), "b": th.randn(5, 3)}, th.rand(5, 2)
+@pytest.mark.parametrize("net_arch", [[8, 6], [8], []])
+def test_ensemble_is_so_many_separate_networks(net_arch):
+    """Values, and gradients with respect to actions."""
+    critics = _critics(net_arch)
+    obs, actions = {"a": th.randn(5, 2), "b": th.randn(5, 3)}, th.rand(5, 2, requires_grad=True)
     q = critics(obs, actions)
     assert q.shape == (3, 5)
     x = th.cat([*(obs[key] for key in SPACE.spaces), actions], dim=-1)
-    for index in range(3):
-        th.testing.assert_close(q[index], _member(critics, index)(x)[:, 0])
+    plain = th.stack([_member(critics, index)(x)[:, 0] for index in range(3)])
+    th.testing.assert_close(q, plain)
+    gradients = [th.autograd.grad(values.square().sum(), actions)[0] for values in (q, plain)]
+    th.testing.assert_close(*gradients)
 
 
 def test_ensemble_members_start_different_and_within_torchs_bounds():
-    weight = _critics().q_networks[2].weight
-    assert not th.equal(weight[0], weight[1])
-    assert weight.abs().max() <= 8**-0.5
-    assert weight.abs().max() > 0.9 * 8**-0.5
+    critics = _critics([64, 64])
+    weights = {5 + 2: critics.input.features_weight, 64: critics.hidden[1].weight}
+    for in_features, weight in weights.items():
+        assert not th.equal(weight[0], weight[1])
+        assert 0.9 * in_features**-0.5 < weight.abs().max() <= in_features**-0.5
+    assert critics.output.weight.abs().max() <= 64**-0.5
 
 
 @pytest.mark.parametrize("dtype", [th.float32, th.float64])

@@ -31,11 +31,13 @@ def _mlp(x, weights, prefix, heads):
 
 def _ensemble(x, weights, prefix):
     """Twin critics with one SiLU hidden layer, in numpy; shape (2, B)."""
+    weights = {name.removeprefix(f"{prefix}."): value for name, value in weights.items() if name.startswith(f"{prefix}.")}
     values = []
     for i in range(2):
-        hidden = x @ weights[f"{prefix}.q_networks.0.weight"][i] + weights[f"{prefix}.q_networks.0.bias"][i]
+        first = np.concatenate([weights["input.features_weight"][i], weights["input.actions_weight"][i]])
+        hidden = x @ first + weights["input.bias"][i]
         hidden = hidden / (1 + np.exp(-hidden))
-        values.append((hidden @ weights[f"{prefix}.q_networks.2.weight"][i] + weights[f"{prefix}.q_networks.2.bias"][i])[:, 0])
+        values.append((hidden @ weights["output.weight"][i].T + weights["output.bias"][i])[:, 0])
     return np.stack(values)
 
 

@@ -15,8 +15,10 @@ from tests.sb3_contract.helpers import make_gac, pendulum
 
 def _hidden_sizes(network):
     """Output sizes of the weights before the heads."""
-    layers = network.latent_net if hasattr(network, "latent_net") else network.q_networks[:-1]
-    return [layer.weight.shape[0 if isinstance(layer, nn.Linear) else -1] for layer in layers if hasattr(layer, "weight")]
+    if hasattr(network, "latent_net"):
+        return [layer.out_features for layer in network.latent_net if isinstance(layer, nn.Linear)]
+    weights = [layer.weight for layer in network.hidden if hasattr(layer, "weight")]
+    return [weight.shape[-1] for weight in ([] if network.input is None else [network.input.features_weight, *weights])]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +70,7 @@ def test_optimizer(tmp_path, optimizer_class, optimizer_kwargs):
 def test_every_parameter_but_the_targets_has_one_optimizer():
     policy = make_gac().policy
     optimizers = (policy.actor_optimizer, policy.critic_optimizer)
-    optimized = [parameter for optimizer in optimizers for parameter in optimizer.param_groups[0]["params"]]
+    optimized = [parameter for optimizer in optimizers for group in optimizer.param_groups for parameter in group["params"]]
     targets = {id(parameter) for _, target in policy.critic_pairs for parameter in target.parameters()}
     assert len(optimized) == len({id(parameter) for parameter in optimized})
     assert {id(parameter) for parameter in policy.parameters()} - targets == {id(parameter) for parameter in optimized}
@@ -76,7 +78,7 @@ def test_every_parameter_but_the_targets_has_one_optimizer():
 
 def test_activation_function():
     model = make_gac(policy_kwargs={"activation_fn": nn.Tanh}).learn(30)
-    for network in (model.policy.learner.latent_net, model.policy.guider.latent_net, model.critic.q_networks):
+    for network in (model.policy.learner.latent_net, model.policy.guider.latent_net, model.critic.hidden):
         assert any(isinstance(layer, nn.Tanh) for layer in network)
         assert not any(isinstance(layer, nn.SiLU) for layer in network)
 
