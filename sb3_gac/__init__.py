@@ -1,6 +1,7 @@
 """Guided Actor-Critic for Stable-Baselines3. Importing it registers the ``sb3_gac/*`` environments with gymnasium."""
 
 from sb3_gac import envs
+from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.callbacks import GuiderLearnerEvalCallback
 from sb3_gac.common.normalization import DeploymentNormalizer
 from sb3_gac.gac.ablations import GACShare, GACWithoutQ
@@ -12,6 +13,7 @@ from sb3_gac.version import __version__
 __all__ = [
     "GAC",
     "PRESETS",
+    "CompactDictReplayBuffer",
     "DeploymentNormalizer",
     "GACPolicy",
     "GACShare",
