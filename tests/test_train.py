@@ -1,0 +1,46 @@
+"""The main job, end to end on a tiny budget."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from sb3_gac import GAC
+from sb3_gac.train import PartialOnly, parse_arguments, train
+
+
+def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_path, capsys):
+    options = ["--task", "InvertedDoublePendulum", "--noise", "0.1", "--steps", "2400", "--seed", "3", "--episodes", "2"]
+    directory = train(parse_arguments([*options, "--runs", str(tmp_path)]))
+    assert directory.parent == tmp_path
+    assert (directory / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
+    configuration = yaml.safe_load((directory / "config.yaml").read_text())
+    assert (configuration["task"], configuration["noise"], configuration["seed"]) == ("InvertedDoublePendulum", 0.1, 3)
+    assert configuration["gac"]["batch_size"] == 128
+    results = json.loads((directory / "results.json").read_text())
+    assert np.isfinite([results["learner"], results["random"]]).all()
+    assert len(results["history"]) == 10
+    last_lines = capsys.readouterr().out
+    assert f"return {results['learner']:.0f}" in last_lines
+    assert f'GAC.load("{directory / "model"}")' in last_lines
+    action, _ = GAC.load(directory / "model").predict({"partial": np.zeros(5, np.float32)}, deterministic=True)
+    assert action.shape == (1,)
+
+
+def test_the_learner_is_evaluated_on_partial_alone():
+    seen = []
+
+    class Model:
+        def predict(self, observation, *args, **kwargs):
+            seen.append(observation)
+
+    PartialOnly(Model()).predict({"partial": 1, "privileged": 2}, deterministic=True)
+    assert seen == [{"partial": 1}]
+
+
+@pytest.mark.parametrize("arguments", [["--task", "Cheetah"], ["--privileged", "all"]])
+def test_unknown_choices_are_refused(arguments, capsys):
+    with pytest.raises(SystemExit):
+        parse_arguments(arguments)
+    assert "invalid choice" in capsys.readouterr().err
