@@ -10,16 +10,24 @@ class UnsupportedActionSpaceError(AssertionError, ValueError):
     """The algorithm can't act in this action space. SB3 raises AssertionError here, so this is one as well."""
 
 
-def check_positive(name: str, value: Any, remedy: str = "") -> None:
+def check_positive(name: str, value: Any, remedy: str = "", bound: str = "> 0") -> None:
     """
-    :raises ValueError: unless ``value`` is a finite number > 0
+    :raises ValueError: unless ``value`` is a finite number > 0; the message says ``bound``
     """
     try:
         positive = 0 < float(value) < float("inf")
     except (TypeError, ValueError):
         positive = False
     if not positive:
-        raise ValueError(f"{name} must be a number > 0{', ' + remedy if remedy else ''}, got {value!r}.")
+        raise ValueError(f"{name} must be a number {bound}{', ' + remedy if remedy else ''}, got {value!r}.")
+
+
+def check_not_negative(name: str, value: Any, remedy: str = "") -> None:
+    """
+    :raises ValueError: unless ``value`` is a finite number >= 0
+    """
+    if value != 0:
+        check_positive(name, value, remedy, bound=">= 0")
 
 
 def check_choice(name: str, value: Any, choices: Any) -> None:

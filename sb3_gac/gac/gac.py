@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_gac.common.checks import check_choice, check_positive
+from sb3_gac.common.checks import check_choice, check_not_negative, check_positive
 from sb3_gac.common.distributions import KL_REDUCTIONS, TanhGaussian, kl_shared_std
 from sb3_gac.common.dual import Coefficient, make_coefficient
 from sb3_gac.common.losses import (
@@ -66,6 +66,9 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     :param guider_lr_scale: the guider's learning rate as a multiple of ``learning_rate``: it corrects a learner that
         moves, and has to do so faster than that moves
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
+    :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
+        is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
+        learner: a pull towards it closes no gap, and the learner chases what moves along with it
     :param learner_entropy: SAC's entropy term in the learner's objective and critics, without which its mean drifts
         into saturation; False for eqs. 15 and 16 as printed
     :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
@@ -110,6 +113,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         guider: str = "residual",
         guider_lr_scale: float = 3.0,
         max_kl: float | None = None,
+        learner_kl_scale: str | float = "auto",
         learner_entropy: bool = True,
         max_grad_norm: float | None = 1.0,
         role_keys: RoleKeys | None = None,
@@ -157,6 +161,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         self.guider = guider
         self.guider_lr_scale = guider_lr_scale
         self.max_kl = max_kl
+        self.learner_kl_scale = learner_kl_scale
         self.learner_entropy = learner_entropy
         if _init_setup_model:
             self._setup_model()
@@ -173,6 +178,10 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         check_choice("guider", self.guider, GUIDERS)
         if self.max_kl is not None:
             check_positive("max_kl", self.max_kl, remedy="or None for no hard bound")
+
+        if self.learner_kl_scale == "auto":
+            self.learner_kl_scale = 0.0 if self.guider == "residual" else 1.0
+        check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
 
     def _policy_options(self) -> dict[str, Any]:
         return super()._policy_options() | {
@@ -297,7 +306,8 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         :return: scalar
         """
         q = self.policy.critic(obs, action)
-        return learner_loss(kl, q, self.kl_coef_dual.value, log_prob, self._learner_ent_coef)
+        kl_weight = float(self.learner_kl_scale) * self.kl_coef_dual.value
+        return learner_loss(kl, q, kl_weight, log_prob, self._learner_ent_coef)
 
     @property
     def _learner_ent_coef(self) -> th.Tensor | float:

@@ -83,6 +83,8 @@ def test_policy_names(policy):
         ({"target_kl": -0.1}, "target_kl must be a number > 0"),
         ({"target_kl": "small"}, "target_kl must be a number > 0"),
         ({"guider_lr_scale": 0}, "guider_lr_scale must be a number > 0"),
+        ({"learner_kl_scale": -1}, "learner_kl_scale must be a number >= 0"),
+        ({"learner_kl_scale": "full"}, 'learner_kl_scale must be a number >= 0, or "auto"'),
         ({"max_kl": 0}, "max_kl must be a number > 0, or None"),
         ({"max_grad_norm": -1}, "max_grad_norm must be a number > 0, or None"),
         ({"kl_coef": "automatic"}, "kl_coef must be"),

@@ -240,7 +240,7 @@ def test_ablations_have_the_critics_that_they_should():
 @pytest.mark.parametrize("learner_entropy", [True, False])
 def test_learner_objective_matches_an_independent_computation(learner_entropy):
     """Eq. 16 from the learner's distribution and its critics, in numpy."""
-    model = small_model(kl_coef=0.7, ent_coef=0.2, learner_entropy=learner_entropy)
+    model = small_model(kl_coef=0.7, ent_coef=0.2, learner_entropy=learner_entropy, learner_kl_scale=0.5)
     obs = {"partial": th.randn(32, 2), "privileged": th.randn(32, 1)}
     learner = model.policy.distributions(obs)[1]
     kl = th.rand(32)
@@ -252,7 +252,7 @@ def test_learner_objective_matches_an_independent_computation(learner_entropy):
     x = np.concatenate([obs["partial"].numpy(), obs["privileged"].numpy(), action], axis=1)
     q = _ensemble(x, _numpy_state(model.policy), "learner_critic").min(axis=0)
     bonus = 0.2 * _log_prob(noise, std, action) if learner_entropy else 0.0
-    assert loss == pytest.approx((0.7 * kl.numpy() + bonus - q).mean(), rel=1e-4)
+    assert loss == pytest.approx((0.5 * 0.7 * kl.numpy() + bonus - q).mean(), rel=1e-4)
 
 
 def test_without_q_the_learner_imitates_and_nothing_else():
@@ -307,3 +307,24 @@ def test_the_guider_learns_at_its_own_rate():
     assert rates[1] < 1e-3
     guider = {id(p) for p in model.policy.guider.parameters()}
     assert {id(p) for p in model.policy.actor_optimizer.param_groups[0]["params"]} == guider
+
+
+@pytest.mark.parametrize(("guider", "scale"), [("residual", 0.0), ("independent", 1.0)])
+def test_the_pull_towards_the_guider_is_there_where_it_can_close_a_gap(guider, scale):
+    assert small_model(guider=guider).learner_kl_scale == scale
+    assert small_model(guider=guider, learner_kl_scale=0.3).learner_kl_scale == 0.3
+
+
+def test_a_residual_guiders_kl_does_not_depend_on_the_learner():
+    """Why "auto" drops the pull: move the learner as far as you like, and KL stays what it was."""
+    model = small_model()
+    obs = {"partial": th.randn(32, 2), "privileged": th.randn(32, 1)}
+    with th.no_grad():
+        model.policy.guider.mean.bias.fill_(0.5)
+        kls = []
+        for shift in (0.0, 3.0):
+            model.policy.learner.mean.bias.fill_(shift)
+            guider, learner, _ = model.policy.distributions(obs)
+            kls.append(model._kl(guider.mean, learner))
+    th.testing.assert_close(*kls, rtol=1e-4, atol=1e-6)
+    assert kls[0].min() > 0.05
