@@ -143,7 +143,7 @@ def train(options: argparse.Namespace) -> Path:
     (directory / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False))
 
     started = time.time()
-    model = GAC("MultiInputPolicy", env, seed=options.seed, tensorboard_log=None, **gac_arguments)
+    model = GAC("MultiInputPolicy", env, seed=options.seed, **gac_arguments)
     callback = GuiderLearnerEvalCallback(
         eval_env,
         eval_seed=EVAL_SEED,

@@ -21,7 +21,7 @@ from sb3_gac.common.checks import (
     check_terminal_observations,
 )
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
-from sb3_gac.common.parallel import halved_threads, run_halves
+from sb3_gac.common.parallel import halved_threads, has_side_effects, run_halves
 from sb3_gac.common.roles import RoleKeys, resolve_role_keys
 
 ENT_COEF_START = 0.1
@@ -263,7 +263,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._scheduled_optimizers())
-        self._halves_together = self.device.type == "cpu" and th.get_num_threads() > 1
+        self._halves_together = self.device.type == "cpu" and th.get_num_threads() > 1 and not has_side_effects(self.policy)
         with halved_threads(self._halves_together):
             history = [self._one_update(batch_size) for _ in range(gradient_steps)]
         self._record_metrics(history)

@@ -14,6 +14,9 @@ from functools import cache
 from typing import TypeVar
 
 import torch as th
+from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
+from torch.nn.modules.dropout import _DropoutNd
 
 T = TypeVar("T")
 
@@ -47,6 +50,11 @@ def run_halves(tasks: Sequence[Callable[[], T]], together: bool) -> list[T]:
     if exception is not None:
         raise exception
     return [result, future.result()]
+
+
+def has_side_effects(module: nn.Module) -> bool:
+    """Whether a forward pass draws random numbers or changes statistics: then its halves must keep their order."""
+    return any(isinstance(part, (_DropoutNd, _BatchNorm)) for part in module.modules())
 
 
 @contextmanager

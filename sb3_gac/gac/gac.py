@@ -226,26 +226,26 @@ class GAC(AsymmetricOffPolicyAlgorithm):
 
     def _critic_targets(self, batch: Batch) -> dict[str, Callable[[], th.Tensor]]:
         """Critics -> what computes their targets, each of shape (B,); all random numbers are drawn here."""
-        critics, next_obs = self.policy, batch.next_observations
+        policy, next_obs = self.policy, batch.next_observations
         with th.no_grad():
-            guider, learner, _ = self.policy.distributions(next_obs)
+            guider, learner, _ = policy.distributions(next_obs)
             next_kl = self._kl(guider.mean, learner)
             guider_action, guider_log_prob = guider.sample_with_log_prob()
             learner_action, learner_log_prob = learner.sample_with_log_prob()
 
         def guided() -> th.Tensor:
-            next_q = critics.guider_critic_target(next_obs, guider_action)
+            next_q = policy.guider_critic_target(next_obs, guider_action)
             coefficients = (self.kl_coef_dual.value, self.ent_coef_dual.value)
             return guided_target(batch.rewards, batch.dones, next_q, next_kl, guider_log_prob, *coefficients, batch.discounts)
 
         def of_learner() -> th.Tensor:
-            next_q = critics.critic_target(next_obs, learner_action)
+            next_q = policy.critic_target(next_obs, learner_action)
             return learner_target(
                 batch.rewards, batch.dones, next_q, batch.discounts, learner_log_prob, self._learner_ent_coef
             )
 
         targets = {"guider_critic": guided, "learner_critic": of_learner}
-        return {name: target for name, target in targets.items() if name in self.policy.network_parameters}
+        return {name: target for name, target in targets.items() if name in policy.network_parameters}
 
     def _critic_gradients(self, name: str, target: Callable[[], th.Tensor], batch: Batch) -> Metrics:
         """Half of the critics' phase: one ensemble's clipped gradients."""

@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch as th
 
-from sb3_gac.common.parallel import halved_threads, run_halves
+from sb3_gac.common.parallel import halved_threads, has_side_effects, run_halves
 from tests.helpers import small_model
 
 
@@ -70,3 +70,9 @@ def test_threads_are_given_back_after_an_error(two_threads):
     with pytest.raises(TypeError):
         model.train(1, 8)
     assert th.get_num_threads() == 2
+
+
+@pytest.mark.parametrize("layer", [th.nn.Dropout(0.1), th.nn.BatchNorm1d(2)])
+def test_halves_keep_their_order_where_a_layer_draws_or_counts(two_threads, layer):
+    assert has_side_effects(th.nn.Sequential(th.nn.Linear(2, 2), layer))
+    assert not has_side_effects(th.nn.Sequential(th.nn.Linear(2, 2), th.nn.LayerNorm(2)))
