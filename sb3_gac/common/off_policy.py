@@ -125,6 +125,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
             super()._setup_model()
         finally:
             self.__dict__.update(as_given)  # saved as the user gave them
+        self._halves_are_independent = self.device.type == "cpu" and not has_side_effects(self.policy)
         self._setup_coefficients()
 
     def _check_arguments(self) -> None:
@@ -263,7 +264,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._scheduled_optimizers())
-        self._halves_together = self.device.type == "cpu" and th.get_num_threads() > 1 and not has_side_effects(self.policy)
+        self._halves_together = self._halves_are_independent and th.get_num_threads() > 1
         with halved_threads(self._halves_together):
             history = [self._one_update(batch_size) for _ in range(gradient_steps)]
         self._record_metrics(history)
