@@ -63,8 +63,8 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     :param kl_coef_learning_rate: of a learned ``kl_coef``
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
     :param guider: "residual": learner plus a privileged correction; "independent": a network of its own (the paper's)
-    :param guider_lr_scale: the guider's learning rate as a multiple of ``learning_rate``: it corrects a learner that
-        moves, and has to do so faster than that moves
+    :param guider_lr_scale: the guider's learning rate as a multiple of ``learning_rate``; with a pull towards a residual
+        guider it has to correct a learner that chases it, and 3 did better
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
         is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
@@ -111,7 +111,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         kl_coef_learning_rate: float = 3e-3,
         kl_reduction: str = "mean",
         guider: str = "residual",
-        guider_lr_scale: float = 3.0,
+        guider_lr_scale: float = 1.0,
         max_kl: float | None = None,
         learner_kl_scale: str | float = "auto",
         learner_entropy: bool = True,

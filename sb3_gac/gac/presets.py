@@ -16,7 +16,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Table 2: use with 128 environments; target_kl per task and noise is in Table 3, this is its middle value
     "paper": {
         "guider": "independent",
-        "guider_lr_scale": 1.0,
         "learner_entropy": False,
         "learning_starts": 10_000,
         "batch_size": 512,
