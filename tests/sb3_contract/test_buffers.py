@@ -6,6 +6,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer
 
+from sb3_gac import CompactDictReplayBuffer
 from tests.sb3_contract.helpers import make_gac, pendulum, vectorized
 
 
@@ -22,9 +23,10 @@ class OwnBuffer(DictReplayBuffer):
         return super().sample(batch_size, env)._replace(discounts=th.full((batch_size, 1), 0.5))
 
 
-def test_default_buffer():
-    model = make_gac(vectorized(pendulum, 2), buffer_size=50)
-    assert type(model.replay_buffer) is DictReplayBuffer
+@pytest.mark.parametrize("buffer_class", [None, DictReplayBuffer])
+def test_default_buffer_and_sb3s(buffer_class):
+    model = make_gac(vectorized(pendulum, 2), buffer_size=50, replay_buffer_class=buffer_class)
+    assert type(model.replay_buffer) is (buffer_class or CompactDictReplayBuffer)
     assert model.replay_buffer.buffer_size == 25
     model.learn(80)
     assert model.replay_buffer.full

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.utils import get_device
@@ -288,9 +289,10 @@ def test_learning_in_pieces_does_not_warn():
     assert model.replay_buffer.pos == 150
 
 
-def test_memory_optimized_buffer_is_refused_for_dict_observations():
+def test_memory_optimisation_is_ours_by_default_and_refused_by_sb3s_buffer():
+    assert make_gac(optimize_memory_usage=True).learn(30)._n_updates > 0
     with pytest.raises(AssertionError, match="optimize_memory_usage"):
-        make_gac(optimize_memory_usage=True, replay_buffer_kwargs={"handle_timeout_termination": False})
+        make_gac(optimize_memory_usage=True, replay_buffer_class=DictReplayBuffer)
 
 
 # --- policies -----------------------------------------------------------------------------------------------------------
