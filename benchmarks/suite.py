@@ -57,8 +57,8 @@ def read_suite(path: Path) -> list[RunSpec]:
 
 
 def _cell_runs(name: str, suite: dict[str, Any], cell: dict[str, Any]) -> Iterator[RunSpec]:
-    _check_keys(f"{name}, a cell", cell, _CELL_KEYS | {"steps", "eval_every"}, _CELL_KEYS)
-    common = {key: cell.get(key, suite[key]) for key in ("steps", "envs", "preset", "eval_every", "eval_episodes")}
+    _check_keys(f"{name}, a cell", cell, _CELL_KEYS, _CELL_KEYS)
+    common = {key: suite[key] for key in ("steps", "envs", "preset", "eval_every", "eval_episodes")}
     for noise in cell["noises"]:
         for seed in cell["seeds"]:
             for algorithm in cell["algorithms"]:
