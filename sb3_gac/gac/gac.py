@@ -63,8 +63,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     :param kl_coef_learning_rate: of a learned ``kl_coef``
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
     :param guider: "residual": learner plus a privileged correction; "independent": a network of its own (the paper's)
-    :param guider_lr_scale: the guider's learning rate as a multiple of ``learning_rate``; with a pull towards a residual
-        guider it has to correct a learner that chases it, and 3 did better
+    :param guider_lr_scale: the guider's learning rate as a multiple of ``learning_rate``
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
         is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
@@ -178,7 +177,6 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         check_choice("guider", self.guider, GUIDERS)
         if self.max_kl is not None:
             check_positive("max_kl", self.max_kl, remedy="or None for no hard bound")
-
         if self.learner_kl_scale == "auto":
             self.learner_kl_scale = 0.0 if self.guider == "residual" else 1.0
         check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
