@@ -55,3 +55,8 @@ def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
         "policy_kwargs": {"net_arch": [16]},
     }
     return cls("MultiInputPolicy", TwoViewBandit() if env is None else env, **{**defaults, **arguments})
+
+
+def optimizers_of(policy: Any) -> list[Any]:
+    """Of all its networks."""
+    return [getattr(policy, name).optimizer for name in policy.network_parameters]

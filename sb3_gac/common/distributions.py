@@ -27,17 +27,23 @@ class TanhGaussian:
         """Deterministic action in [-1, 1], shape (\\*E, A)."""
         return th.tanh(self.mean)
 
+    def detach(self) -> "TanhGaussian":
+        """The same distribution as a constant."""
+        return TanhGaussian(self.mean.detach(), self.log_std.detach())
+
     def sample(self) -> th.Tensor:
         """Reparameterised action in [-1, 1], shape (\\*E, A)."""
         return th.tanh(self._pre_tanh(th.randn_like(self.mean)))
 
-    def sample_with_log_prob(self) -> tuple[th.Tensor, th.Tensor]:
+    def sample_with_log_prob(self, noise: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
         """
         Reparameterised action and its log-probability.
 
+        :param noise: standard normal, shape (\\*E, A); drawn here if ``None``
         :return: action in [-1, 1], shape (\\*E, A), and log-probability, shape (\\*E)
         """
-        noise = th.randn_like(self.mean)
+        if noise is None:
+            noise = th.randn_like(self.mean)
         pre_tanh = self._pre_tanh(noise)
         return th.tanh(pre_tanh), self._log_prob(pre_tanh, noise)
 

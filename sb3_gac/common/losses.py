@@ -124,7 +124,7 @@ def guider_loss(
 
 
 def learner_loss(
-    kl: th.Tensor,
+    kl: th.Tensor | float,
     q: th.Tensor,
     kl_coef: th.Tensor | float,
     log_prob: th.Tensor | float = 0.0,

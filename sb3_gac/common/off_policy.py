@@ -21,7 +21,9 @@ from sb3_gac.common.checks import (
     check_terminal_observations,
 )
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
+from sb3_gac.common.losses import critic_loss
 from sb3_gac.common.parallel import halved_threads, has_side_effects, run_halves
+from sb3_gac.common.policies import AsymmetricPolicy
 from sb3_gac.common.roles import RoleKeys, resolve_role_keys
 
 ENT_COEF_START = 0.1
@@ -82,6 +84,8 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
+    policy_class: type[AsymmetricPolicy]
+    policy: AsymmetricPolicy
 
     def __init__(
         self,
@@ -125,7 +129,9 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
             super()._setup_model()
         finally:
             self.__dict__.update(as_given)  # saved as the user gave them
-        self._halves_are_independent = self.device.type == "cpu" and not has_side_effects(self.policy)
+        self._halves_are_independent = (
+            self.device.type == "cpu" and self.policy.halves_are_independent and not has_side_effects(self.policy)
+        )
         self._setup_coefficients()
 
     def _check_arguments(self) -> None:
@@ -137,7 +143,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"{type(self).__name__} supports Box action spaces only, but the environment has {self.action_space}. "
                 "Wrap the environment so that its actions are continuous."
             )
-        resolve_role_keys(self.observation_space, self.role_keys)
+        resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
         if self.replay_buffer_class in (ReplayBuffer, NStepReplayBuffer):
             raise ValueError(
                 f"replay_buffer_class={self.replay_buffer_class.__name__} can't hold Dict observations: "
@@ -171,7 +177,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
     @property
     def actor(self) -> th.nn.Module:  # type: ignore[override]
         """The deployed policy."""
-        return self.policy.actor  # type: ignore[return-value]
+        return self.policy.actor
 
     @property
     def critic(self) -> th.nn.Module:
@@ -213,8 +219,8 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         if self.num_timesteps < learning_starts:
             return super()._sample_action(learning_starts, action_noise, n_envs)
-        assert self._last_obs is not None
-        scaled_action, _ = self.policy.behaviour_action(self._last_obs)  # type: ignore[operator]
+        assert isinstance(self._last_obs, dict)
+        scaled_action, _ = self.policy.behaviour_action(self._last_obs)
         if action_noise is not None:
             scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled_action), scaled_action
@@ -273,18 +279,43 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         metrics = self._gradient_step(self._sample_batch(batch_size))
         self._n_updates += 1
         if self._n_updates % self.target_update_interval == 0:
-            self.policy.update_targets(self.tau)  # type: ignore[operator]
+            self.policy.update_targets(self.tau)
         return metrics
 
-    def _run_halves(self, tasks: Sequence[Callable[[], Metrics]]) -> Metrics:
+    def _run_halves(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
         """
         :param tasks: independent of each other, see :func:`run_halves`
-        :return: the metrics of all
+        :return: their results
         """
-        metrics: Metrics = {}
-        for result in run_halves(tasks, self._halves_together):
-            metrics |= result
-        return metrics
+        return run_halves(tasks, self._halves_together)
+
+    def _fit_critics(self, name: str, batch: Batch, target: th.Tensor) -> Metrics:
+        """
+        One step of an ensemble towards its Bellman targets.
+
+        :param name: attribute of the policy
+        :param batch: B transitions
+        :param target: shape (B,)
+        :return: loss, mean Q and gradient norm, named after the ensemble
+        """
+        q = getattr(self.policy, name)(batch.observations, batch.actions)
+        return {f"{name}_q": q.detach().mean()} | self._descend(name, critic_loss(q, target))
+
+    def _descend(self, name: str, loss: th.Tensor, unclipped_loss: th.Tensor | float = 0.0) -> Metrics:
+        """
+        One step of a network's optimiser; whatever else the loss went through stays as it is.
+
+        :param name: attribute of the policy
+        :param loss: scalar
+        :param unclipped_loss: of parameters that have no say in the clipping
+        :return: loss and gradient norm, named after the network
+        """
+        policy, optimizer = self.policy, getattr(self.policy, name).optimizer
+        optimizer.zero_grad()
+        (loss + unclipped_loss).backward(inputs=policy.network_parameters[name])
+        grad_norm = clip_gradients(policy.clipped_parameters[name], self.max_grad_norm)
+        optimizer.step()
+        return {f"{name}_loss": loss.detach(), f"{name}_grad_norm": grad_norm}
 
     @abstractmethod
     def _gradient_step(self, batch: Batch) -> Metrics:
@@ -309,8 +340,8 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
         """Optimisers that follow ``learning_rate``."""
-        optimizers = [self.policy.actor_optimizer, self.policy.critic_optimizer, self.ent_coef_optimizer]
-        return [optimizer for optimizer in optimizers if optimizer is not None]  # type: ignore[misc]
+        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.network_parameters]
+        return optimizers if self.ent_coef_optimizer is None else [*optimizers, self.ent_coef_optimizer]
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         """Follow the schedule; a parameter group's "lr_scale" multiplies it."""
@@ -325,8 +356,11 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         if not history:
             return
         names = list(history[0])
-        values = th.stack([th.stack([step[name].reshape(()) for name in names]) for step in history]).mean(dim=0)
-        for name, value in zip(names, values.tolist(), strict=True):
+        means = th.stack([th.stack([step[name].reshape(()) for name in names]) for step in history]).mean(dim=0)
+        values = dict(zip(names, means.tolist(), strict=True))
+        values["actor_loss"] = values[f"{self.policy.roles.deployed}_loss"]  # SB3's names for the two
+        values["critic_loss"] = sum(value for name, value in values.items() if name.endswith("critic_loss"))
+        for name, value in values.items():
             self.logger.record(f"train/{name}", value)
 
     # --- save and load ----------------------------------------------------------------------------------------------
@@ -339,7 +373,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         return [*super()._excluded_save_params(), *self._dual_names()]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts = ["policy", "policy.actor_optimizer", "policy.critic_optimizer"]
+        state_dicts = ["policy", *(f"policy.{name}.optimizer" for name in self.policy.network_parameters)]
         tensors = []
         for dual in self._dual_names():
             dual_state_dicts, dual_tensors = getattr(self, dual).state_names

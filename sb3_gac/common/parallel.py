@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch as th
 from torch import nn
@@ -33,7 +33,7 @@ def _with_threads(task: Callable[[], T], threads: int) -> T:
     return task()
 
 
-def run_halves(tasks: Sequence[Callable[[], T]], together: bool) -> list[T]:
+def run_halves(tasks: Sequence[Callable[[], Any]], together: bool) -> list[Any]:
     """
     :param tasks: one or two that share nothing that either changes; random numbers must be drawn before
     :param together: whether to run them at once; an error in either is raised either way

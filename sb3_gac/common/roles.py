@@ -1,14 +1,30 @@
 """Which observation entries each role reads: resolved and checked once, when a model is set up."""
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from gymnasium import spaces
 
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 
-ROLES = ("guider", "learner", "guider_critic", "learner_critic")
-
 RoleKeys = Mapping[str, Sequence[str]]
+
+
+class Roles(NamedTuple):
+    """
+    The networks of an algorithm.
+
+    :param deployed: the policy that acts without privileged entries
+    :param others: the rest; names of critics end in "critic"
+    """
+
+    deployed: str
+    others: tuple[str, ...]
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """Every role, the deployed one first."""
+        return (self.deployed, *self.others)
 
 
 def check_observation_space(observation_space: spaces.Space) -> spaces.Dict:
@@ -24,30 +40,33 @@ def check_observation_space(observation_space: spaces.Space) -> spaces.Dict:
     return observation_space
 
 
-def resolve_role_keys(observation_space: spaces.Space, role_keys: RoleKeys | None = None) -> dict[str, tuple[str, ...]]:
+def resolve_role_keys(
+    observation_space: spaces.Space, roles: Roles, role_keys: RoleKeys | None = None
+) -> dict[str, tuple[str, ...]]:
     """
     Complete and check the mapping from roles to observation entries.
 
-    By default the learner reads ``partial`` alone and every other role reads every entry: the guider must see what
-    the learner sees, noise included, or it cannot stay close to it.
+    By default the deployed policy reads ``partial`` alone and every other role reads every entry: a guider must see
+    what its learner sees, noise included, or it cannot stay close to it.
 
     :param observation_space: of the environment
+    :param roles: of the algorithm
     :param role_keys: role -> entries, for the roles that differ from the default
-    :return: role -> entries, for all of ``ROLES``
+    :return: role -> entries, for all roles
     :raises ValueError: if a role or an entry is unknown, an entry list is empty, or there is no ``partial`` entry
-        for the learner
+        for the deployed policy
     """
     entries = tuple(check_observation_space(observation_space).spaces)
     role_keys = role_keys or {}
-    unknown_roles = sorted(set(role_keys) - set(ROLES))
+    unknown_roles = sorted(set(role_keys) - set(roles.all))
     if unknown_roles:
-        raise ValueError(f"role_keys names unknown roles {unknown_roles}; the roles are {list(ROLES)}.")
-    if "learner" not in role_keys and PARTIAL not in entries:
+        raise ValueError(f"role_keys names unknown roles {unknown_roles}; the roles are {list(roles.all)}.")
+    if roles.deployed not in role_keys and PARTIAL not in entries:
         raise ValueError(
             f'The observation has no entry "{PARTIAL}" (its entries are {list(entries)}). Rename the entry that the '
-            f'learner may see to "{PARTIAL}", or name it with role_keys={{"learner": ["<entry>"]}}.'
+            f'{roles.deployed} may see to "{PARTIAL}", or name it with role_keys={{"{roles.deployed}": ["<entry>"]}}.'
         )
-    resolved = dict.fromkeys(ROLES, entries) | {"learner": (PARTIAL,)}
+    resolved = dict.fromkeys(roles.all, entries) | {roles.deployed: (PARTIAL,)}
     for role, keys in role_keys.items():
         if isinstance(keys, str) or not keys:
             raise ValueError(f'role_keys["{role}"] must be a non-empty list of observation entries, got {keys!r}.')
@@ -65,29 +84,26 @@ def role_space(observation_space: spaces.Dict, keys: Sequence[str]) -> spaces.Di
     return spaces.Dict({key: observation_space.spaces[key] for key in keys})
 
 
-def resolve_net_arch(net_arch: list[int] | Mapping[str, list[int]] | None) -> dict[str, list[int]]:
+def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]] | None) -> dict[str, list[int]]:
     """
     Hidden layer sizes per role.
 
-    :param net_arch: one list for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each of
-        ``guider``, ``learner``, ``critic``; ``None`` for [256, 256]
-    :return: role -> sizes, for all of ``ROLES``
+    :param roles: of the algorithm
+    :param net_arch: one list for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each policy and one
+        for "critic"; ``None`` for [256, 256]
+    :return: role -> sizes, for all roles
     :raises ValueError: if the names are of neither form
     """
     if net_arch is None:
         net_arch = [256, 256]
     if isinstance(net_arch, list):
-        return dict.fromkeys(ROLES, net_arch)
+        return dict.fromkeys(roles.all, net_arch)
+    policies = [role for role in roles.all if not role.endswith("critic")]
     if set(net_arch) == {"pi", "qf"}:
-        net_arch = {"guider": net_arch["pi"], "learner": net_arch["pi"], "critic": net_arch["qf"]}
-    if set(net_arch) != {"guider", "learner", "critic"}:
+        net_arch = {**dict.fromkeys(policies, net_arch["pi"]), "critic": net_arch["qf"]}
+    if set(net_arch) != {*policies, "critic"}:
         raise ValueError(
-            'net_arch must be a list, {"pi": [...], "qf": [...]} or {"guider": [...], "learner": [...], "critic": [...]}, '
+            f'net_arch must be a list, {{"pi": [...], "qf": [...]}} or one list for each of {[*policies, "critic"]}, '
             f"got {net_arch!r}."
         )
-    return {
-        "guider": net_arch["guider"],
-        "learner": net_arch["learner"],
-        "guider_critic": net_arch["critic"],
-        "learner_critic": net_arch["critic"],
-    }
+    return {role: net_arch[role if role in policies else "critic"] for role in roles.all}

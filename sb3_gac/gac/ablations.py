@@ -7,6 +7,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.common.losses import distillation_loss
 from sb3_gac.gac.gac import GAC
+from sb3_gac.gac.policies import ActionDistributions
 
 
 class GACShare(GAC):
@@ -19,5 +20,5 @@ class GACShare(GAC):
 class GACWithoutQ(GACShare):
     """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14)."""
 
-    def _learner_loss(self, obs: PyTorchObs, kl: th.Tensor, action: th.Tensor, log_prob: th.Tensor) -> th.Tensor:
-        return distillation_loss(kl)
+    def _learner_loss(self, obs: PyTorchObs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
+        return distillation_loss(self._kl(now.guider.detach(), now.learner))

@@ -1,7 +1,6 @@
 """Guided Actor-Critic."""
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -17,19 +16,25 @@ from sb3_gac.common.checks import check_choice, check_not_negative, check_positi
 from sb3_gac.common.distributions import KL_REDUCTIONS, TanhGaussian, kl_shared_std
 from sb3_gac.common.dual import Coefficient, make_coefficient
 from sb3_gac.common.losses import (
-    critic_loss,
     guided_target,
     guider_loss,
     learner_loss,
     learner_target,
     log_std_loss,
 )
-from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm, Batch, Metrics, clip_gradients
+from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm, Batch, Metrics
 from sb3_gac.common.roles import RoleKeys
 from sb3_gac.gac.actors import GUIDERS
-from sb3_gac.gac.policies import GACPolicy, MultiInputPolicy
+from sb3_gac.gac.policies import ActionDistributions, ActorOutputs, GACPolicy, MultiInputPolicy
 
 KL_COEF_START = 1.0
+
+
+def _on_both(network: th.nn.Module, batch: Batch) -> tuple[ActorOutputs, ActorOutputs]:
+    """A policy's outputs on the observations, and, as constants, on the next ones."""
+    now = network(batch.observations)
+    with th.no_grad():
+        return now, network(batch.next_observations)
 
 
 class GAC(AsymmetricOffPolicyAlgorithm):
@@ -199,128 +204,112 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     # --- one gradient step (Algorithm 1) ----------------------------------------------------------------------------
 
     def _gradient_step(self, batch: Batch) -> Metrics:
-        """Critics, guider and learner, beta, alpha; the targets follow in :meth:`train`."""
-        metrics = self._update_critics(batch)
-        policy_metrics, kl, log_prob = self._update_policies(batch.observations)
-        metrics |= policy_metrics
+        """
+        Guider and learner each fit their critics (eqs. 12, 15) and then climb them (eqs. 13, 16); then beta and alpha.
+
+        The halves share nothing that either changes, so they may run at once. The targets follow in :meth:`train`.
+        """
+        now, later = self._run_policies(batch)
+        noise = th.randn((4, *now.learner.mean.shape), device=self.device)
+        guider_half = partial(self._guider_half, batch, now, later, noise[:2])
+        learner_half = partial(self._learner_half, batch, now, later, noise[2:])
+        (metrics, kl, log_prob), learner_metrics = self._run_halves([guider_half, learner_half])
         ent_metrics = self.ent_coef_dual.update(log_prob + float(self.target_entropy))
         kl_metrics = self.kl_coef_dual.update(kl - self.current_target_kl)
+        metrics |= learner_metrics
         metrics |= {f"ent_coef_{name}": value for name, value in ent_metrics.items() if name == "loss"}
         metrics |= {f"kl_coef_{name}": value for name, value in kl_metrics.items()}
-        return metrics | self._policy_diagnostics(kl, log_prob)
+        return metrics | self._policy_diagnostics(now, kl, log_prob)
 
     @property
     def current_target_kl(self) -> float:
         """The bound on KL at this point of training."""
         return self.target_kl_schedule(self._current_progress_remaining)
 
-    def _update_critics(self, batch: Batch) -> Metrics:
-        """Eqs. 12 and 15."""
-        targets = self._critic_targets(batch)
-        self.policy.critic_optimizer.zero_grad()
-        metrics = self._run_halves([partial(self._critic_gradients, *target, batch) for target in targets.items()])
-        self.policy.critic_optimizer.step()
-        return metrics | {"critic_loss": th.stack([metrics[f"{name}_loss"] for name in targets]).sum()}
+    def _run_policies(self, batch: Batch) -> tuple[ActionDistributions, ActionDistributions]:
+        """Both policies on the observations, and, as constants, on the next ones."""
+        guider, learner = self._run_halves(
+            [partial(_on_both, self.policy.guider, batch), partial(_on_both, self.policy.learner, batch)]
+        )
+        now, later = (self.policy.combine(*outputs) for outputs in zip(guider, learner, strict=True))
+        return now, later
 
-    def _critic_targets(self, batch: Batch) -> dict[str, Callable[[], th.Tensor]]:
-        """Critics -> what computes their targets, each of shape (B,); all random numbers are drawn here."""
-        policy, next_obs = self.policy, batch.next_observations
-        with th.no_grad():
-            guider, learner, _ = policy.distributions(next_obs)
-            next_kl = self._kl(guider.mean, learner)
-            guider_action, guider_log_prob = guider.sample_with_log_prob()
-            learner_action, learner_log_prob = learner.sample_with_log_prob()
-
-        def guided() -> th.Tensor:
-            next_q = policy.guider_critic_target(next_obs, guider_action)
-            coefficients = (self.kl_coef_dual.value, self.ent_coef_dual.value)
-            return guided_target(batch.rewards, batch.dones, next_q, next_kl, guider_log_prob, *coefficients, batch.discounts)
-
-        def of_learner() -> th.Tensor:
-            next_q = policy.critic_target(next_obs, learner_action)
-            return learner_target(
-                batch.rewards, batch.dones, next_q, batch.discounts, learner_log_prob, self._learner_ent_coef
-            )
-
-        targets = {"guider_critic": guided, "learner_critic": of_learner}
-        return {name: target for name, target in targets.items() if name in policy.network_parameters}
-
-    def _critic_gradients(self, name: str, target: Callable[[], th.Tensor], batch: Batch) -> Metrics:
-        """Half of the critics' phase: one ensemble's clipped gradients."""
-        with th.no_grad():
-            y = target()
-        q = getattr(self.policy, name)(batch.observations, batch.actions)
-        loss = critic_loss(q, y)
-        loss.backward()
-        grad_norm = self._clip_gradients(name)
-        return {f"{name}_loss": loss.detach(), f"{name}_q": q.detach().mean(), f"{name}_grad_norm": grad_norm}
-
-    def _update_policies(self, obs: PyTorchObs) -> tuple[Metrics, th.Tensor, th.Tensor]:
+    def _guider_half(
+        self, batch: Batch, now: ActionDistributions, later: ActionDistributions, noise: th.Tensor
+    ) -> tuple[Metrics, th.Tensor, th.Tensor]:
         """
-        Eqs. 13 and 16: the gradients of the two objectives meet in no parameter.
+        Eqs. 12 and 13.
 
+        :param batch: B transitions
+        :param now: the policies on the observations
+        :param later: the policies on the next observations
+        :param noise: standard normal, for the next action and for the present one, shape (2, B, A)
         :return: metrics; KL(guider || learner) and the guider's log-probability, detached, each of shape (B,)
         """
-        guider, learner, deployment_log_std = self.policy.distributions(obs)
-        action, log_prob = guider.sample_with_log_prob()
-        learner_sample = learner.sample_with_log_prob()
-        kl = self._kl(guider.mean, TanhGaussian(learner.mean.detach(), learner.log_std))
+        metrics = self._fit_critics("guider_critic", batch, self._guided_target(batch, later, noise[0]))
+        action, log_prob = now.guider.sample_with_log_prob(noise[1])
+        kl = self._kl(now.guider, now.learner.detach())
+        q = self.policy.guider_critic(batch.observations, action)
+        loss = guider_loss(kl, log_prob, q, self.kl_coef_dual.value, self.ent_coef_dual.value)
+        return metrics | self._descend("guider", loss), kl.detach(), log_prob.detach()
 
-        def guider_objective() -> th.Tensor:
-            q = self.policy.guider_critic(obs, action)
-            return guider_loss(kl, log_prob, q, self.kl_coef_dual.value, self.ent_coef_dual.value)
+    @th.no_grad()
+    def _guided_target(self, batch: Batch, later: ActionDistributions, noise: th.Tensor) -> th.Tensor:
+        """Eq. 12, shape (B,)."""
+        action, log_prob = later.guider.sample_with_log_prob(noise)
+        next_q = self.policy.guider_critic_target(batch.next_observations, action)
+        next_kl = self._kl(later.guider, later.learner)
+        coefficients = (self.kl_coef_dual.value, self.ent_coef_dual.value)
+        return guided_target(batch.rewards, batch.dones, next_q, next_kl, log_prob, *coefficients, batch.discounts)
 
-        def learner_objective() -> th.Tensor:
-            return self._learner_loss(obs, self._kl(guider.mean.detach(), learner), *learner_sample)
+    def _learner_half(self, batch: Batch, now: ActionDistributions, later: ActionDistributions, noise: th.Tensor) -> Metrics:
+        """
+        Eqs. 15 and 16, and the fit of the std for deployment. Arguments are those of :meth:`_guider_half`.
+        """
+        metrics: Metrics = {}
+        if self.policy.learner_critic is not None:
+            metrics = self._fit_critics("learner_critic", batch, self._learner_target(batch, later, noise[0]))
+        loss = self._learner_loss(batch.observations, now, noise[1])
+        deployment_loss = log_std_loss(now.deployment_log_std, now.learner.log_std)
+        metrics |= self._descend("learner", loss, deployment_loss)
+        return metrics | {"log_std_loss": deployment_loss.detach()}
 
-        self.policy.actor_optimizer.zero_grad()
-        objectives = {"guider": guider_objective, "learner": learner_objective}
-        metrics = self._run_halves([partial(self._policy_gradients, *objective) for objective in objectives.items()])
-        deployment_loss = log_std_loss(deployment_log_std, learner.log_std)
-        deployment_loss.backward()
-        self.policy.actor_optimizer.step()
-        metrics |= {
-            "actor_loss": metrics["learner_loss"],
-            "log_std_loss": deployment_loss.detach(),
-            "std": learner.log_std.exp().mean(),
-            "learner_mean_abs": learner.mean.detach().abs().mean(),
-        }
-        return metrics, kl.detach(), log_prob.detach()
+    @th.no_grad()
+    def _learner_target(self, batch: Batch, later: ActionDistributions, noise: th.Tensor) -> th.Tensor:
+        """Eq. 15, shape (B,)."""
+        action, log_prob = later.learner.sample_with_log_prob(noise)
+        next_q = self.policy.critic_target(batch.next_observations, action)
+        return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, self._learner_ent_coef)
 
-    def _policy_gradients(self, name: str, objective: Callable[[], th.Tensor]) -> Metrics:
-        """Half of the policies' phase: one policy's clipped gradients; the critics stay as they are."""
-        loss = objective()
-        loss.backward(inputs=self.policy.network_parameters[name])
-        return {f"{name}_loss": loss.detach(), f"{name}_grad_norm": self._clip_gradients(name)}
-
-    def _learner_loss(self, obs: PyTorchObs, kl: th.Tensor, action: th.Tensor, log_prob: th.Tensor) -> th.Tensor:
+    def _learner_loss(self, obs: PyTorchObs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
         """
         Eq. 16, with the learner's critics, or the guided ones where it has none.
 
         :param obs: full observation, B of each entry
-        :param kl: KL(sg mu || pi), shape (B,)
-        :param action: from the learner, reparameterised, shape (B, A)
-        :param log_prob: of that action, shape (B,)
+        :param now: the policies on it
+        :param noise: standard normal, shape (B, A)
         :return: scalar
         """
+        action, log_prob = now.learner.sample_with_log_prob(noise)
         q = self.policy.critic(obs, action)
-        kl_weight = float(self.learner_kl_scale) * self.kl_coef_dual.value
-        return learner_loss(kl, q, kl_weight, log_prob, self._learner_ent_coef)
+        kl: th.Tensor | float = 0.0
+        if self.learner_kl_scale:
+            kl = float(self.learner_kl_scale) * self._kl(now.guider.detach(), now.learner)
+        return learner_loss(kl, q, self.kl_coef_dual.value, log_prob, self._learner_ent_coef)
 
     @property
     def _learner_ent_coef(self) -> th.Tensor | float:
         return self.ent_coef_dual.value if self.learner_entropy else 0.0
 
-    def _kl(self, guider_mean: th.Tensor, learner: TanhGaussian) -> th.Tensor:
+    def _kl(self, guider: TanhGaussian, learner: TanhGaussian) -> th.Tensor:
         """KL(guider || learner) with the std that ``learner`` borrowed, shape (B,)."""
-        return kl_shared_std(guider_mean, learner.mean, learner.log_std.exp(), self.kl_reduction)
+        return kl_shared_std(guider.mean, learner.mean, learner.log_std.exp(), self.kl_reduction)
 
-    def _clip_gradients(self, network: str) -> th.Tensor:
-        return clip_gradients(self.policy.network_parameters[network], self.max_grad_norm)
-
-    def _policy_diagnostics(self, kl: th.Tensor, log_prob: th.Tensor) -> Metrics:
+    def _policy_diagnostics(self, now: ActionDistributions, kl: th.Tensor, log_prob: th.Tensor) -> Metrics:
         target = self.current_target_kl
         return {
+            "std": now.learner.log_std.exp().mean(),
+            "learner_mean_abs": now.learner.mean.detach().abs().mean(),
             "kl": kl.mean(),
             "kl_p95": kl.kthvalue(math.ceil(0.95 * kl.numel())).values,
             "kl_above_target": (kl > target).float().mean(),

@@ -1,5 +1,7 @@
 """GAC's gradient step against an independent computation, what it learns, what it logs, and what it refuses."""
 
+import math
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,6 +10,8 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_gac import GAC, GACShare, GACWithoutQ, preset
+from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.gac.policies import ActionDistributions
 from tests.helpers import TwoViewBandit, small_model
 
 LOGGED = {
@@ -56,10 +60,12 @@ def test_critic_targets_match_an_independent_computation(guider, learner_entropy
         model.policy.guider.mean.bias.add_(0.3)
     batch = model._sample_batch(32)
     th.manual_seed(5)
-    guided, of_learner = (target().detach().double().numpy() for target in model._critic_targets(batch).values())
+    noise = th.randn(2, 32, 1)
+    later = model.policy.distributions(batch.next_observations)
+    guided = model._guided_target(batch, later, noise[0]).double().numpy()
+    of_learner = model._learner_target(batch, later, noise[1]).double().numpy()
 
-    th.manual_seed(5)
-    guider_noise, learner_noise = (th.randn(32, 1).double().numpy() for _ in range(2))
+    guider_noise, learner_noise = noise.double().numpy()
     weights = _numpy_state(model.policy)
     o, s = (batch.next_observations[key].double().numpy() for key in ("partial", "privileged"))
     full = np.concatenate([o, s], axis=1)
@@ -84,8 +90,8 @@ def test_residual_guider_starts_at_the_learner_and_its_kl_is_half_its_squared_ou
     obs = {"partial": th.randn(64, 2), "privileged": th.randn(64, 1)}
     guider, learner, _ = model.policy.distributions(obs)
     delta = model.policy.guider.mean(model.policy.guider.latent(obs))
-    th.testing.assert_close(model._kl(guider.mean, learner), 0.5 * delta.square().mean(-1), rtol=1e-3, atol=1e-6)
-    assert model._kl(guider.mean, learner).mean() < 1e-3
+    th.testing.assert_close(model._kl(guider, learner), 0.5 * delta.square().mean(-1), rtol=1e-3, atol=1e-6)
+    assert model._kl(guider, learner).mean() < 1e-3
 
 
 @pytest.mark.parametrize("guider", ["residual", "independent"])
@@ -96,7 +102,7 @@ def test_max_kl_bounds_the_kl_of_every_state(guider, kl_reduction):
         model.policy.guider.mean.weight.mul_(1000)
     obs = {"partial": 10 * th.randn(64, 2), "privileged": 10 * th.randn(64, 1)}
     distributions = model.policy.distributions(obs)
-    kl = model._kl(distributions[0].mean, distributions[1])
+    kl = model._kl(distributions[0], distributions[1])
     assert kl.max() <= 0.01 * 1.001
     assert kl.max() > 0.009, "the bound was never met, so nothing was tested"
 
@@ -131,9 +137,12 @@ def test_logged_values_are_means_over_the_gradient_steps():
     original = model._gradient_step
     model._gradient_step = lambda batch: history.append(original(batch)) or history[-1]
     model.train(gradient_steps=5, batch_size=8)
-    expected = np.mean([step["critic_loss"].item() for step in history])
-    assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(expected, rel=1e-5)
-    assert model.logger.name_to_value["train/kl_coef"] == 0.5
+    logged = model.logger.name_to_value
+    for name in ("guider_critic_loss", "learner_critic_loss", "learner_loss"):
+        assert logged[f"train/{name}"] == pytest.approx(np.mean([step[name].item() for step in history]), rel=1e-5)
+    assert logged["train/critic_loss"] == logged["train/guider_critic_loss"] + logged["train/learner_critic_loss"]
+    assert logged["train/actor_loss"] == logged["train/learner_loss"]
+    assert logged["train/kl_coef"] == 0.5
 
 
 def test_targets_follow_at_their_interval():
@@ -242,23 +251,26 @@ def test_learner_objective_matches_an_independent_computation(learner_entropy):
     """Eq. 16 from the learner's distribution and its critics, in numpy."""
     model = small_model(kl_coef=0.7, ent_coef=0.2, learner_entropy=learner_entropy, learner_kl_scale=0.5)
     obs = {"partial": th.randn(32, 2), "privileged": th.randn(32, 1)}
-    learner = model.policy.distributions(obs)[1]
-    kl = th.rand(32)
-    th.manual_seed(5)
-    loss = model._learner_loss(obs, kl, *learner.sample_with_log_prob()).item()
-    th.manual_seed(5)
-    noise, mean, std = (x.detach().double().numpy() for x in (th.randn(32, 1), learner.mean, learner.log_std.exp()))
+    with th.no_grad():  # a guider that differs from its learner
+        model.policy.guider.mean.bias.add_(0.3)
+    now, noise = model.policy.distributions(obs), th.randn(32, 1)
+    loss = model._learner_loss(obs, now, noise).item()
+    tensors = (noise, now.learner.mean, now.learner.log_std.exp(), now.guider.mean)
+    noise, mean, std, guider_mean = (x.detach().double().numpy() for x in tensors)
+    kl = (((guider_mean - mean) / std) ** 2 / 2)[:, 0]
     action = np.tanh(mean + std * noise)
     x = np.concatenate([obs["partial"].numpy(), obs["privileged"].numpy(), action], axis=1)
     q = _ensemble(x, _numpy_state(model.policy), "learner_critic").min(axis=0)
     bonus = 0.2 * _log_prob(noise, std, action) if learner_entropy else 0.0
-    assert loss == pytest.approx((0.5 * 0.7 * kl.numpy() + bonus - q).mean(), rel=1e-4)
+    assert loss == pytest.approx((0.5 * 0.7 * kl + bonus - q).mean(), rel=1e-4)
 
 
 def test_without_q_the_learner_imitates_and_nothing_else():
     model = small_model(cls=GACWithoutQ)
-    kl = th.tensor([0.2, 0.4])
-    assert model._learner_loss({}, kl, th.zeros(2, 1), th.zeros(2)).item() == pytest.approx(0.3)
+    learner = TanhGaussian(th.zeros(2, 1), th.full((2, 1), math.log(0.5)))
+    guider = TanhGaussian(th.tensor([[0.2], [0.4]]), learner.log_std)
+    loss = model._learner_loss({}, ActionDistributions(guider, learner, learner.log_std), th.randn(2, 1))
+    assert loss.item() == pytest.approx(0.5 * (0.4**2 + 0.8**2) / 2)
 
 
 @pytest.mark.parametrize("name", ["small", "paper"])
@@ -293,20 +305,19 @@ def test_target_entropy_conventions():
 
 def test_optimizers_are_where_sac_has_them():
     model = small_model()
-    assert model.actor.optimizer is model.policy.actor_optimizer
-    assert model.critic.optimizer is model.policy.critic_optimizer
+    for network in (model.actor, model.critic):
+        optimised = [id(p) for group in network.optimizer.param_groups for p in group["params"]]
+        assert optimised == [id(p) for p in network.parameters()]
     assert model.policy.net_arch == [16]
 
 
 def test_the_guider_learns_at_its_own_rate():
     model = small_model(learning_rate=LinearSchedule(1e-3, 0.0, 1.0), guider_lr_scale=3.0)
     model.learn(50)
-    rates = [group["lr"] for group in model.policy.actor_optimizer.param_groups]
+    rates = [network.optimizer.param_groups[0]["lr"] for network in (model.policy.guider, model.policy.learner)]
     assert rates[0] == pytest.approx(3 * rates[1])
     assert rates[1] == pytest.approx(model.lr_schedule(model._current_progress_remaining))
     assert rates[1] < 1e-3
-    guider = {id(p) for p in model.policy.guider.parameters()}
-    assert {id(p) for p in model.policy.actor_optimizer.param_groups[0]["params"]} == guider
 
 
 @pytest.mark.parametrize(("guider", "scale"), [("residual", 0.0), ("independent", 1.0)])
@@ -325,6 +336,6 @@ def test_a_residual_guiders_kl_does_not_depend_on_the_learner():
         for shift in (0.0, 3.0):
             model.policy.learner.mean.bias.fill_(shift)
             guider, learner, _ = model.policy.distributions(obs)
-            kls.append(model._kl(guider.mean, learner))
+            kls.append(model._kl(guider, learner))
     th.testing.assert_close(*kls, rtol=1e-4, atol=1e-6)
     assert kls[0].min() > 0.05

@@ -8,7 +8,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from sb3_gac import GAC, GACShare, GACWithoutQ
 from sb3_gac.common.distributions import TanhGaussian
 from sb3_gac.common.losses import critic_loss, distillation_loss, guider_loss, learner_loss, log_std_loss
-from tests.helpers import small_model
+from tests.helpers import optimizers_of, small_model
 
 
 def _observations(n=8):
@@ -38,14 +38,14 @@ def model(request):
 def test_guider_loss_moves_the_guider_alone(model):
     obs = _observations()
     guider, learner, _ = model.policy.distributions(obs)
-    kl = model._kl(guider.mean, TanhGaussian(learner.mean.detach(), learner.log_std))
+    kl = model._kl(guider, learner.detach())
     log_prob = guider.sample_with_log_prob()[1]
     assert _reached(model.policy, guider_loss(kl, log_prob, th.zeros(2, 8), 1.0, 0.1)) == {"guider"}
 
 
 def test_learner_kl_moves_the_learner_alone_and_not_its_log_std_head(model):
     guider, learner, _ = model.policy.distributions(_observations())
-    kl = model._kl(guider.mean.detach() + 0.1, learner)
+    kl = model._kl(TanhGaussian(guider.mean.detach() + 0.1, guider.log_std), learner)
     assert _reached(model.policy, distillation_loss(kl)) == {"learner"}
 
 
@@ -70,7 +70,7 @@ def test_each_critic_loss_moves_its_own_critics(model, part):
 
 def test_kl_does_not_move_the_std(model):
     guider, learner, _ = model.policy.distributions(_observations())
-    kl = model._kl(guider.mean + 0.1, TanhGaussian(learner.mean.detach(), learner.log_std))
+    kl = model._kl(TanhGaussian(guider.mean + 0.1, guider.log_std), learner.detach())
     for parameter in model.policy.parameters():
         parameter.grad = None
     kl.sum().backward()
@@ -98,17 +98,23 @@ def _filled(cls, **arguments):
 def test_updates_leave_the_other_networks_bit_for_bit(cls, critics):
     model = _filled(cls)
     batch = model._sample_batch(32)
-    assert _changed_parts(model, lambda: model._update_critics(batch)) == critics
-    assert _changed_parts(model, lambda: model._update_policies(batch.observations)) == {"guider", "learner"}
+    now, later = model._run_policies(batch)
+    noise = th.randn(2, 32, 1)
+    own = critics & {"learner_critic"}
+    assert _changed_parts(model, lambda: model._guider_half(batch, now, later, noise)) == {"guider", "guider_critic"}
+    assert _changed_parts(model, lambda: model._learner_half(batch, now, later, noise)) == {"learner"} | own
     targets = {f"{name}_target" for name in critics}
     assert _changed_parts(model, lambda: model.policy.update_targets(0.5)) == targets
 
 
-def test_policy_update_leaves_no_gradient_in_the_critics():
-    model = _filled(GAC)
+@pytest.mark.parametrize("cls", [GAC, GACShare])
+def test_policy_updates_leave_no_gradient_in_the_critics(cls):
+    model = _filled(cls)
     batch = model._sample_batch(32)
-    model.policy.critic_optimizer.zero_grad()
-    model._update_policies(batch.observations)
+    now, _ = model._run_policies(batch)
+    q = model.policy.guider_critic(batch.observations, now.guider.sample()).mean()
+    model._descend("guider", -q)
+    model._descend("learner", model._learner_loss(batch.observations, now, th.randn(32, 1)))
     assert all(p.grad is None for critic, _ in model.policy.critic_pairs for p in critic.parameters())
 
 
@@ -179,19 +185,21 @@ class TestSharedEncoder:
         batch = model._sample_batch(32)
         encoder = model.policy.learner.features_extractor.linear.weight
         before = encoder.detach().clone()
-        model._update_critics(batch)
+        now, later = model._run_policies(batch)
+        noise = th.randn(2, 32, 1)
+        model._guider_half(batch, now, later, noise)
+        model._fit_critics("learner_critic", batch, model._learner_target(batch, later, noise[0]))
         assert th.equal(encoder, before)
-        guider = model.policy.distributions(batch.observations)[0]
-        assert "learner" not in _reached(model.policy, guider.mean.sum() + guider.log_std.sum())
-        model._update_policies(batch.observations)
+        model._learner_half(batch, now, later, noise)
         assert not th.equal(encoder, before)
+        guider = model.policy.distributions(batch.observations).guider
+        assert "learner" not in _reached(model.policy, guider.mean.sum() + guider.log_std.sum())
 
     def test_is_optimised_once_and_followed_by_the_targets(self, model):
-        optimised = [id(p) for group in model.policy.actor_optimizer.param_groups for p in group["params"]]
+        optimised = [id(p) for opt in optimizers_of(model.policy) for group in opt.param_groups for p in group["params"]]
         assert len(optimised) == len(set(optimised))
-        of_critics = {id(p) for group in model.policy.critic_optimizer.param_groups for p in group["params"]}
-        assert of_critics.isdisjoint(optimised)
-        model._update_policies(model._sample_batch(32).observations)
+        assert id(model.policy.learner.features_extractor.linear.weight) in optimised
+        model._gradient_step(model._sample_batch(32))
         model.policy.update_targets(1.0)
         critic, target = model.policy.critic_pairs[1]
         assert all(th.equal(p, q) for p, q in zip(critic.parameters(), target.parameters(), strict=True))

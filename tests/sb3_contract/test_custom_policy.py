@@ -10,6 +10,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_gac import GAC, GACPolicy
+from tests.helpers import optimizers_of
 from tests.sb3_contract.helpers import make_gac, pendulum
 
 
@@ -61,7 +62,7 @@ def test_optimizer(tmp_path, optimizer_class, optimizer_kwargs):
     model = make_gac(policy_kwargs=policy_kwargs, train_freq=2).learn(40)
     model.save(tmp_path / "model")
     for one in (model, GAC.load(tmp_path / "model")):
-        for optimizer in (one.policy.actor_optimizer, one.policy.critic_optimizer):
+        for optimizer in optimizers_of(one.policy):
             assert type(optimizer) is optimizer_class
             for name, value in (optimizer_kwargs or {}).items():
                 assert optimizer.param_groups[0][name] == value
@@ -69,7 +70,7 @@ def test_optimizer(tmp_path, optimizer_class, optimizer_kwargs):
 
 def test_every_parameter_but_the_targets_has_one_optimizer():
     policy = make_gac().policy
-    optimizers = (policy.actor_optimizer, policy.critic_optimizer)
+    optimizers = optimizers_of(policy)
     optimized = [parameter for optimizer in optimizers for group in optimizer.param_groups for parameter in group["params"]]
     targets = {id(parameter) for _, target in policy.critic_pairs for parameter in target.parameters()}
     assert len(optimized) == len({id(parameter) for parameter in optimized})

@@ -11,6 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
 from sb3_gac import GAC, GACShare, GACWithoutQ
+from tests.helpers import optimizers_of
 from tests.sb3_contract.helpers import make_gac, pendulum
 
 
@@ -128,7 +129,7 @@ def test_learning_rate_schedule_reaches_the_optimizers():
     model = make_gac(learning_rate=lambda progress: 1e-4 * (1 + progress)).learn(40)
     lr = model.logger.name_to_value["train/learning_rate"]
     assert lr == pytest.approx(1e-4)
-    for optimizer in (model.policy.actor_optimizer, model.policy.critic_optimizer, model.ent_coef_optimizer):
+    for optimizer in (*optimizers_of(model.policy), model.ent_coef_optimizer):
         assert optimizer.param_groups[0]["lr"] == pytest.approx(lr)
 
 

@@ -70,8 +70,9 @@ def test_exact_match_misses_objects_and_tensors():
 def test_parameters_are_those_of_policy_and_every_optimizer():
     params = make_gac().get_parameters()
     assert next(iter(params)) == "policy"
-    optimizers = {"policy.actor_optimizer", "policy.critic_optimizer", "ent_coef_dual.optimizer", "kl_coef_dual.optimizer"}
-    assert set(params) == {"policy"} | optimizers
+    networks = ("learner", "guider", "guider_critic", "learner_critic")
+    optimizers = {f"policy.{network}.optimizer" for network in networks}
+    assert set(params) == {"policy", "ent_coef_dual.optimizer", "kl_coef_dual.optimizer"} | optimizers
 
 
 def test_set_parameters_changes_what_it_is_given_and_nothing_else():

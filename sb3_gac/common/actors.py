@@ -1,0 +1,124 @@
+"""Policy networks on the entries of one role: the base of all, and of those that are deployed."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.common.networks import RoleModel
+
+LOG_STD_BOUNDS = (-5.0, 1.0)
+
+
+class RolePolicy(RoleModel, BasePolicy):
+    """
+    A policy network on the entries of its role: encoder and hidden layers; subclasses add the heads.
+
+    :param observation_space: the entries that this role reads
+    :param action_space: Box
+    :param net_arch: hidden layer sizes
+    :param features_extractor: encoder of the entries
+    :param features_dim: its output size
+    :param activation_fn: between layers
+    :param normalize_images: divide images by 255
+    :param rest_extractor: encoder of the entries that the deployed policy does not read, if
+        ``features_extractor`` is the deployed policy's and this is another role
+    :param log_std_bounds: smallest and largest log standard deviation before tanh
+    """
+
+    features_extractor: BaseFeaturesExtractor
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        normalize_images: bool = True,
+        rest_extractor: BaseFeaturesExtractor | None = None,
+        log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.rest_extractor = rest_extractor
+        self.net_arch = net_arch
+        self.features_dim = features_dim
+        self.activation_fn = activation_fn
+        self.log_std_bounds = log_std_bounds
+        self.latent_net = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
+        latent_dim = net_arch[-1] if net_arch else features_dim
+        action_dim = get_action_dim(action_space)
+        self.mean = nn.Linear(latent_dim, action_dim)
+        self.log_std = nn.Linear(latent_dim, action_dim)
+
+    def latent(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        :param obs: observation with at least the entries of this role, B of each
+        :return: last hidden layer, shape (B, H)
+        """
+        return self.latent_net(self.extract_features(obs, self.features_extractor))
+
+    def bounded_log_std(self, latent: th.Tensor) -> th.Tensor:
+        """
+        :param latent: shape (B, H)
+        :return: log standard deviation before tanh, shape (B, A)
+        """
+        return self.log_std(latent).clamp(*self.log_std_bounds)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {
+            "net_arch": self.net_arch,
+            "features_extractor": self.features_extractor,
+            "features_dim": self.features_dim,
+            "activation_fn": self.activation_fn,
+            "rest_extractor": self.rest_extractor,
+            "log_std_bounds": self.log_std_bounds,
+        }
+
+
+class DeployedPolicy(RolePolicy):
+    """
+    The policy that ``predict`` stands for: it needs its own entries and ignores all others.
+
+    A subclass's ``forward`` gives mean and log standard deviation before tanh, both of shape (B, A).
+    """
+
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """
+        :param observation: single or batched; a dict with at least the policy's entries, or, where the policy
+            reads one entry, that entry alone
+        :return: tensors of the policy's entries, and whether they were batched
+        :raises ValueError: if one of the policy's entries is missing
+        """
+        return super().obs_to_tensor(self._own_entries(observation))
+
+    def _own_entries(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        assert isinstance(self.observation_space, spaces.Dict)
+        keys = list(self.observation_space.spaces)
+        if not isinstance(observation, Mapping):
+            if len(keys) > 1:
+                raise ValueError(f"The policy reads {keys}: pass predict() a dict with these entries, not an array.")
+            return {keys[0]: observation}
+        missing = [key for key in keys if key not in observation]
+        if missing:
+            raise ValueError(f"The observation passed to predict() lacks {missing}, which the policy reads.")
+        return {key: observation[key] for key in keys}
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        action = TanhGaussian(*self(observation))
+        return action.mode if deterministic else action.sample()

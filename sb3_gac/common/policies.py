@@ -1,0 +1,262 @@
+"""What policies with a privileged view share: networks by role, target critics, optimisers; as a policy, the deployed one."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import get_parameters_by_name
+from torch import nn
+
+from sb3_gac.common.actors import DeployedPolicy
+from sb3_gac.common.networks import CriticEnsemble, VectorExtractor, polyak_average, trainable
+from sb3_gac.common.roles import RoleKeys, Roles, resolve_net_arch, resolve_role_keys, role_space
+
+
+class AsymmetricPolicy(BasePolicy):
+    """
+    Networks that read the observation entries of their roles, and their optimisers.
+
+    A subclass names its ``roles``, builds a network for each as the attribute of that name, with its target as
+    ``<name>_target`` where it is a critic, and then calls :meth:`_finish`.
+
+    :param observation_space: Dict
+    :param action_space: Box
+    :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}``, or one for each policy and one for "critic"
+    :param activation_fn: between layers
+    :param role_keys: role -> observation entries, see :func:`sb3_gac.common.roles.resolve_role_keys`
+    :param n_critics: size of each critic ensemble
+    :param features_extractor_class: encoder, made once per role on the entries of that role
+    :param features_extractor_kwargs: keyword arguments for it
+    :param share_features_extractor: whether the other roles see the deployed policy's features of its entries, as they
+        are, and encode only the other entries themselves; the deployed policy's loss trains that encoder (saves most
+        of the work where ``partial`` is an image)
+    :param normalize_images: divide images by 255
+    :param optimizer_class: optimiser of policies and critics
+    :param optimizer_kwargs: keyword arguments for it, without the learning rate
+    """
+
+    roles: ClassVar[Roles]
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        role_keys: RoleKeys | None = None,
+        n_critics: int = 2,
+        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        share_features_extractor: bool = False,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            features_extractor_kwargs,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=True,
+            normalize_images=normalize_images,
+        )
+        self.constructor_options: dict[str, Any] = {
+            "net_arch": net_arch,
+            "activation_fn": activation_fn,
+            "role_keys": role_keys,
+            "n_critics": n_critics,
+            "share_features_extractor": share_features_extractor,
+        }
+        self.net_arch = net_arch
+        self.n_critics = n_critics
+        self.share_features_extractor = share_features_extractor
+        self.role_keys = resolve_role_keys(observation_space, self.roles, role_keys)
+        self._role_net_arch = resolve_net_arch(self.roles, net_arch)
+
+    # --- networks ---------------------------------------------------------------------------------------------------
+
+    def _role_kwargs(self, role: str, shared: BaseFeaturesExtractor | None = None) -> dict[str, Any]:
+        """
+        Constructor arguments of a role's network.
+
+        :param role: one of ``roles``
+        :param shared: the deployed policy's encoder, if this role is to use it; without it the role gets one of its own
+        """
+        features_extractor, rest_extractor = shared, None
+        if shared is None:
+            features_extractor = self._make_extractor(self.role_keys[role])
+        else:
+            rest_extractor = self._make_extractor(self._keys_beside_the_deployed(role))
+        extractors = [extractor for extractor in (features_extractor, rest_extractor) if extractor is not None]
+        return {
+            "observation_space": role_space(self.observation_space, self.role_keys[role]),  # type: ignore[arg-type]
+            "action_space": self.action_space,
+            "net_arch": self._role_net_arch[role],
+            "features_extractor": features_extractor,
+            "rest_extractor": rest_extractor,
+            "features_dim": sum(extractor.features_dim for extractor in extractors),
+            "activation_fn": self.constructor_options["activation_fn"],
+            "normalize_images": self.normalize_images,
+        }
+
+    def _make_extractor(self, keys: Sequence[str]) -> BaseFeaturesExtractor:
+        space = role_space(self.observation_space, keys)  # type: ignore[arg-type]
+        if self.features_extractor_class is CombinedExtractor and VectorExtractor.fits(space):
+            return VectorExtractor(space)
+        return self.features_extractor_class(space, **self.features_extractor_kwargs)
+
+    def _keys_beside_the_deployed(self, role: str) -> list[str]:
+        shared = self.role_keys[self.roles.deployed]
+        keys = [key for key in self.role_keys[role] if key not in shared]
+        if not keys or not set(shared) < set(self.role_keys[role]):
+            raise ValueError(
+                f"share_features_extractor=True needs a {role} that reads all of the {self.roles.deployed}'s entries "
+                f"{list(shared)} and others, but it reads {list(self.role_keys[role])}."
+            )
+        return keys
+
+    def _make_critic_and_target(
+        self, role: str, shared: BaseFeaturesExtractor | None
+    ) -> tuple[CriticEnsemble, CriticEnsemble]:
+        critic = CriticEnsemble(**self._role_kwargs(role, shared), n_critics=self.n_critics)
+        target = CriticEnsemble(**self._role_kwargs(role, deepcopy(shared)), n_critics=self.n_critics)
+        target.load_state_dict(critic.state_dict())
+        target.set_training_mode(False)
+        return critic, target
+
+    def _finish(self, lr_schedule: Schedule, lr_scales: Mapping[str, float] | None = None) -> None:
+        """
+        Once all networks are there: collect their parameters, for walking a module tree costs more than an update, and
+        give each network its optimiser, as the attribute that SB3's SAC has on actor and critic.
+
+        :param lr_schedule: learning rate schedule
+        :param lr_scales: role -> multiple of the learning rate
+        """
+        critics, targets = zip(*self.critic_pairs, strict=True)
+        self._critic_parameters: list[th.Tensor] = [p for critic in critics for p in critic.parameters()]
+        self._target_parameters: list[th.Tensor] = [p for target in targets for p in target.parameters()]
+        self._has_statistics = any(get_parameters_by_name(critic, ["running_"]) for critic in critics)
+        self.network_parameters = self._parameters_by_network()
+        self.clipped_parameters = self.network_parameters
+        kwargs = dict(self.optimizer_kwargs)
+        if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
+            kwargs.setdefault("fused", True)
+        for name, parameters in self.network_parameters.items():
+            group = {"params": parameters, "lr_scale": (lr_scales or {}).get(name, 1.0)}
+            getattr(self, name).optimizer = self.optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore
+
+    def _parameters_by_network(self) -> dict[str, list[nn.Parameter]]:
+        """Role -> what its optimiser may change; a shared encoder is the deployed policy's, whoever else holds it."""
+        deployed = list(self.actor.parameters())
+        others = {role: getattr(self, role) for role in self.roles.others if getattr(self, role) is not None}
+        return {
+            self.roles.deployed: trainable(deployed),
+            **{role: trainable(network.parameters(), but=deployed) for role, network in others.items()},
+        }
+
+    @property
+    def actor(self) -> DeployedPolicy:
+        """SB3's name for the policy that acts at evaluation."""
+        return getattr(self, self.roles.deployed)
+
+    @property
+    def critic_pairs(self) -> list[tuple[CriticEnsemble, CriticEnsemble]]:
+        """(critic, target) of each critic that there is."""
+        critics = [role for role in self.roles.others if role.endswith("critic") and getattr(self, role) is not None]
+        return [(getattr(self, role), getattr(self, f"{role}_target")) for role in critics]
+
+    def update_targets(self, tau: float) -> None:
+        """
+        Polyak averaging of the targets, tau theta + (1 - tau) theta_bar; running statistics are copied.
+
+        :param tau: in [0, 1]
+        """
+        polyak_average(self._critic_parameters, self._target_parameters, tau)
+        if not self._has_statistics:
+            return
+        for critic, target in self.critic_pairs:  # not collected once: a move to another device replaces buffers
+            polyak_average(get_parameters_by_name(critic, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
+
+    # --- acting -----------------------------------------------------------------------------------------------------
+
+    @property
+    def halves_are_independent(self) -> bool:
+        """Whether the two halves of a gradient step share nothing that either changes."""
+        return not self.share_features_extractor
+
+    @abstractmethod
+    def behaviour_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
+        """
+        Action of the policy that collects the data, in [-1, 1].
+
+        :param observation: full observation, single or batched
+        :param deterministic: mode instead of a sample
+        :return: shape (B, \\*action shape), and whether the observation was batched
+        """
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        The deployed policy's action; entries that it does not read are ignored.
+
+        :param observation: single or batched; ``{"partial": ...}``, a full dict, or the partial entry alone
+        :param state: passed through
+        :param episode_start: ignored
+        :param deterministic: mode instead of a sample
+        :return: action in the environment's range, and ``state``
+        """
+        return self.actor.predict(observation, state, episode_start, deterministic)
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """The deployed policy's action in [-1, 1], shape (B, A)."""
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.actor._predict(observation, deterministic)
+
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """
+        :param observation: dict of observation entries, single or batched; unknown entries are dropped
+        :return: tensors, and whether they were batched
+        """
+        if not isinstance(observation, Mapping):
+            return self.actor.obs_to_tensor(observation)
+        known = self.observation_space.spaces  # type: ignore[attr-defined]
+        return super().obs_to_tensor({key: value for key, value in observation.items() if key in known})
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Put policies and critics in training or evaluation mode; targets stay in evaluation mode.
+
+        :param mode: True for training
+        """
+        for role in self.network_parameters:
+            getattr(self, role).set_training_mode(mode)
+        self.training = mode
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return (
+            super()._get_constructor_parameters()
+            | self.constructor_options
+            | {
+                "lr_schedule": self._dummy_schedule,
+                "optimizer_class": self.optimizer_class,
+                "optimizer_kwargs": self.optimizer_kwargs,
+                "features_extractor_class": self.features_extractor_class,
+                "features_extractor_kwargs": self.features_extractor_kwargs,
+            }
+        )
