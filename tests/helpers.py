@@ -59,4 +59,4 @@ def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
 
 def optimizers_of(policy: Any) -> list[Any]:
     """Of all its networks."""
-    return [getattr(policy, name).optimizer for name in policy.network_parameters]
+    return [getattr(policy, name).optimizer for name in policy.flat_parameters]

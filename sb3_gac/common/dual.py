@@ -21,9 +21,13 @@ class FixedCoefficient:
         self.optimizer: th.optim.Optimizer | None = None
         self.state_names: tuple[list[str], list[str]] = ([], ["value"])
 
-    def update(self, violation: th.Tensor) -> dict[str, th.Tensor]:
-        """Nothing to learn, nothing to log."""
-        return {}
+    def update(self, violation: th.Tensor) -> th.Tensor:
+        """Nothing to learn: a loss of zero."""
+        return th.zeros_like(self.value)
+
+    def on_bound(self) -> th.Tensor:
+        """It has none: zero."""
+        return th.zeros_like(self.value)
 
 
 class DualVariable:
@@ -40,20 +44,26 @@ class DualVariable:
         self.bounds = bounds
         self._log_bounds = (math.log(bounds[0]), math.log(bounds[1]))
         self.log_value = th.full((1,), math.log(initial), device=device, requires_grad=True)
-        self.optimizer: th.optim.Optimizer | None = th.optim.Adam([self.log_value], lr=learning_rate)
+        self.optimizer: th.optim.Optimizer | None = th.optim.Adam([self.log_value], lr=learning_rate, fused=True)
         self.state_names: tuple[list[str], list[str]] = (["optimizer"], ["log_value"])
 
     @property
     def value(self) -> th.Tensor:
-        """The coefficient, detached, shape (1,)."""
-        return self.log_value.detach().exp()
+        """The coefficient, detached, scalar."""
+        return self.log_value.detach().exp().squeeze(0)
 
-    def update(self, violation: th.Tensor) -> dict[str, th.Tensor]:
+    def on_bound(self) -> th.Tensor:
+        """1 if the coefficient sits on one of its bounds, else 0, scalar."""
+        low, high = self._log_bounds
+        log_value = self.log_value.detach().squeeze(0)
+        return ((log_value <= low) | (log_value >= high)).float()
+
+    def update(self, violation: th.Tensor) -> th.Tensor:
         """
         One gradient step: up while the mean violation is positive, down while it is negative.
 
         :param violation: constraint violation per sample, shape (\\*E)
-        :return: "loss", and "on_bound": 1 if the coefficient sits on one of its bounds, else 0
+        :return: loss, detached, scalar
         """
         assert self.optimizer is not None
         with th.no_grad():
@@ -61,8 +71,7 @@ class DualVariable:
             self.log_value.grad = loss.view(1)  # d/dx (-exp(x) v) = -exp(x) v: the gradient is the loss itself
             self.optimizer.step()
             self.log_value.clamp_(*self._log_bounds)
-            on_bound = (self.log_value <= self._log_bounds[0]) | (self.log_value >= self._log_bounds[1])
-        return {"loss": loss, "on_bound": on_bound.float().mean()}
+        return loss
 
 
 Coefficient = FixedCoefficient | DualVariable

@@ -1,7 +1,7 @@
 """What off-policy algorithms with a privileged view share: acting, the train loop, logging, checks and save lists."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
 from sb3_gac.common.losses import critic_loss
 from sb3_gac.common.parallel import halved_threads, has_side_effects, run_halves
 from sb3_gac.common.policies import AsymmetricPolicy
-from sb3_gac.common.roles import RoleKeys, resolve_role_keys
+from sb3_gac.common.roles import RoleKeys, resolve_lr_scales, resolve_role_keys
 
 ENT_COEF_START = 0.1
 ENT_COEF_BOUNDS = (1e-8, 1e4)
@@ -52,21 +52,6 @@ class Batch(NamedTuple):
     discounts: th.Tensor | float
 
 
-def clip_gradients(parameters: list[th.nn.Parameter], max_norm: float | None) -> th.Tensor:
-    """
-    Scale gradients in place to a norm of at most ``max_norm``, without waiting for the device.
-
-    :param parameters: of one network; those without a gradient are left alone
-    :param max_norm: ``None`` leaves the gradients as they are
-    :return: norm before clipping, scalar
-    """
-    with_gradient = [parameter for parameter in parameters if parameter.grad is not None]
-    norm = th.nn.utils.get_total_norm([parameter.grad for parameter in with_gradient])  # type: ignore[misc]
-    if max_norm is not None:
-        th.nn.utils.clip_grads_with_norm_(with_gradient, max_norm, norm)
-    return norm
-
-
 class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
@@ -79,6 +64,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param target_entropy: "auto" for -0.5 per action dimension, "sac" for SAC's -1 per dimension, or a number
     :param target_update_interval: gradient steps between two updates of the target networks
     :param max_grad_norm: bound on the gradient norm of each network, ``None`` for no bound
+    :param lr_scales: network -> multiple of the learning rate; "critic" stands for all critics
     :param role_keys: role -> observation entries, where they differ from the default
     :param kwargs: arguments of SB3's ``OffPolicyAlgorithm``
     """
@@ -95,6 +81,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         target_entropy: str | float = "auto",
         target_update_interval: int = 1,
         max_grad_norm: float | None = 1.0,
+        lr_scales: Mapping[str, float] | None = None,
         role_keys: RoleKeys | None = None,
         **kwargs: Any,
     ):
@@ -103,6 +90,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.target_entropy = target_entropy
         self.target_update_interval = target_update_interval
         self.max_grad_norm = max_grad_norm
+        self.lr_scales = lr_scales
         self.role_keys = role_keys
         self._halves_together = False
 
@@ -144,6 +132,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
                 "Wrap the environment so that its actions are continuous."
             )
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
+        resolve_lr_scales(self.policy_class.roles, self.lr_scales)
         if self.replay_buffer_class in (ReplayBuffer, NStepReplayBuffer):
             raise ValueError(
                 f"replay_buffer_class={self.replay_buffer_class.__name__} can't hold Dict observations: "
@@ -165,7 +154,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _policy_options(self) -> dict[str, Any]:
         """Arguments of the policy class that are arguments of the algorithm."""
-        return {"role_keys": self.role_keys}
+        return {"role_keys": self.role_keys, "lr_scales": self.lr_scales}
 
     def _setup_coefficients(self) -> None:
         self.ent_coef_dual: Coefficient = make_coefficient(
@@ -269,14 +258,15 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param batch_size: transitions per step, B
         """
         self.policy.set_training_mode(True)
+        self.policy.refresh_parameters()
         self._update_learning_rate(self._scheduled_optimizers())
         self._halves_together = self._halves_are_independent and th.get_num_threads() > 1
         with halved_threads(self._halves_together):
-            history = [self._one_update(batch_size) for _ in range(gradient_steps)]
+            history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
         self._record_metrics(history)
 
-    def _one_update(self, batch_size: int) -> Metrics:
-        metrics = self._gradient_step(self._sample_batch(batch_size))
+    def _one_update(self, batch_size: int, diagnose: bool) -> Metrics:
+        metrics = self._gradient_step(self._sample_batch(batch_size), diagnose)
         self._n_updates += 1
         if self._n_updates % self.target_update_interval == 0:
             self.policy.update_targets(self.tau)
@@ -310,20 +300,20 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param unclipped_loss: of parameters that have no say in the clipping
         :return: loss and gradient norm, named after the network
         """
-        policy, optimizer = self.policy, getattr(self.policy, name).optimizer
-        optimizer.zero_grad()
-        (loss + unclipped_loss).backward(inputs=policy.network_parameters[name])
-        grad_norm = clip_gradients(policy.clipped_parameters[name], self.max_grad_norm)
-        optimizer.step()
+        parameters = self.policy.flat_parameters[name]
+        parameters.backward(loss + unclipped_loss)
+        grad_norm = parameters.clip_gradient(self.max_grad_norm)
+        getattr(self.policy, name).optimizer.step()
         return {f"{name}_loss": loss.detach(), f"{name}_grad_norm": grad_norm}
 
     @abstractmethod
-    def _gradient_step(self, batch: Batch) -> Metrics:
+    def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
         """
         One update of all networks but the targets.
 
         :param batch: B transitions
-        :return: detached scalars to log under "train/", left on the device
+        :param diagnose: whether to add what costs extra, as on the last of a round
+        :return: detached tensors of shape () to log under "train/", left on the device
         """
 
     def _sample_batch(self, batch_size: int) -> Batch:
@@ -340,7 +330,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
         """Optimisers that follow ``learning_rate``."""
-        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.network_parameters]
+        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.flat_parameters]
         return optimizers if self.ent_coef_optimizer is None else [*optimizers, self.ent_coef_optimizer]
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
@@ -351,13 +341,15 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
                 group["lr"] *= group.get("lr_scale", 1.0)
 
     def _record_metrics(self, history: list[Metrics]) -> None:
-        """Log means over the gradient steps of one ``train()``: the only host transfer there is."""
+        """Log means over the gradient steps of one ``train()``, and diagnostics of the last: the only host transfer."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if not history:
             return
-        names = list(history[0])
-        means = th.stack([th.stack([step[name].reshape(()) for name in names]) for step in history]).mean(dim=0)
-        values = dict(zip(names, means.tolist(), strict=True))
+        names, last = list(history[0]), history[-1]
+        means = th.stack([th.stack([step[name] for name in names]) for step in history]).mean(dim=0)
+        diagnostics = [name for name in last if name not in names]
+        means = th.cat([means, *(last[name].reshape(1) for name in diagnostics)])
+        values = dict(zip([*names, *diagnostics], means.tolist(), strict=True))
         values["actor_loss"] = values[f"{self.policy.roles.deployed}_loss"]  # SB3's names for the two
         values["critic_loss"] = sum(value for name, value in values.items() if name.endswith("critic_loss"))
         for name, value in values.items():
@@ -373,7 +365,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         return [*super()._excluded_save_params(), *self._dual_names()]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts = ["policy", *(f"policy.{name}.optimizer" for name in self.policy.network_parameters)]
+        state_dicts = ["policy", *(f"policy.{name}.optimizer" for name in self.policy.flat_parameters)]
         tensors = []
         for dual in self._dual_names():
             dual_state_dicts, dual_tensors = getattr(self, dual).state_names

@@ -15,8 +15,9 @@ from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy
+from sb3_gac.common.flat import FlatParameters
 from sb3_gac.common.networks import CriticEnsemble, VectorExtractor, polyak_average, trainable
-from sb3_gac.common.roles import RoleKeys, Roles, resolve_net_arch, resolve_role_keys, role_space
+from sb3_gac.common.roles import RoleKeys, Roles, resolve_lr_scales, resolve_net_arch, resolve_role_keys, role_space
 
 
 class AsymmetricPolicy(BasePolicy):
@@ -31,6 +32,7 @@ class AsymmetricPolicy(BasePolicy):
     :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}``, or one for each policy and one for "critic"
     :param activation_fn: between layers
     :param role_keys: role -> observation entries, see :func:`sb3_gac.common.roles.resolve_role_keys`
+    :param lr_scales: network -> multiple of the learning rate, see :func:`sb3_gac.common.roles.resolve_lr_scales`
     :param n_critics: size of each critic ensemble
     :param features_extractor_class: encoder, made once per role on the entries of that role
     :param features_extractor_kwargs: keyword arguments for it
@@ -51,6 +53,7 @@ class AsymmetricPolicy(BasePolicy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.SiLU,
         role_keys: RoleKeys | None = None,
+        lr_scales: Mapping[str, float] | None = None,
         n_critics: int = 2,
         features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
@@ -73,6 +76,7 @@ class AsymmetricPolicy(BasePolicy):
             "net_arch": net_arch,
             "activation_fn": activation_fn,
             "role_keys": role_keys,
+            "lr_scales": lr_scales,
             "n_critics": n_critics,
             "share_features_extractor": share_features_extractor,
         }
@@ -133,35 +137,46 @@ class AsymmetricPolicy(BasePolicy):
         target.set_training_mode(False)
         return critic, target
 
-    def _finish(self, lr_schedule: Schedule, lr_scales: Mapping[str, float] | None = None) -> None:
+    def _finish(self, lr_schedule: Schedule, unclipped: int = 0) -> None:
         """
-        Once all networks are there: collect their parameters, for walking a module tree costs more than an update, and
-        give each network its optimiser, as the attribute that SB3's SAC has on actor and critic.
+        Once all networks are there: lay out their parameters, and give each network its optimiser, as the attribute that
+        SB3's SAC has on actor and critic.
 
         :param lr_schedule: learning rate schedule
-        :param lr_scales: role -> multiple of the learning rate
+        :param unclipped: how many of the deployed policy's last parameters have no say in the clipping of its gradient
         """
-        critics, targets = zip(*self.critic_pairs, strict=True)
-        self._critic_parameters: list[th.Tensor] = [p for critic in critics for p in critic.parameters()]
-        self._target_parameters: list[th.Tensor] = [p for target in targets for p in target.parameters()]
-        self._has_statistics = any(get_parameters_by_name(critic, ["running_"]) for critic in critics)
-        self.network_parameters = self._parameters_by_network()
-        self.clipped_parameters = self.network_parameters
+        deployed = list(self.actor.parameters())  # with a shared encoder, whoever else holds it
+        self.flat_parameters = {self.roles.deployed: FlatParameters(trainable(deployed), unclipped)}
+        for role in self.roles.others:
+            if getattr(self, role) is not None:
+                self.flat_parameters[role] = FlatParameters(trainable(getattr(self, role).parameters(), but=deployed))
         kwargs = dict(self.optimizer_kwargs)
         if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
             kwargs.setdefault("fused", True)
-        for name, parameters in self.network_parameters.items():
-            group = {"params": parameters, "lr_scale": (lr_scales or {}).get(name, 1.0)}
-            getattr(self, name).optimizer = self.optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore
+        lr_scales = resolve_lr_scales(self.roles, self.constructor_options["lr_scales"])
+        for role, parameters in self.flat_parameters.items():
+            group = {"params": [parameters.flat], "lr_scale": lr_scales[role]}
+            getattr(self, role).optimizer = self.optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore
+        self._collect_targets()
 
-    def _parameters_by_network(self) -> dict[str, list[nn.Parameter]]:
-        """Role -> what its optimiser may change; a shared encoder is the deployed policy's, whoever else holds it."""
-        deployed = list(self.actor.parameters())
-        others = {role: getattr(self, role) for role in self.roles.others if getattr(self, role) is not None}
-        return {
-            self.roles.deployed: trainable(deployed),
-            **{role: trainable(network.parameters(), but=deployed) for role, network in others.items()},
-        }
+    def _collect_targets(self) -> None:
+        """What Polyak averaging goes through: flat parameters, unless some are frozen or another network's."""
+        self._flat_targets: list[FlatParameters] = []
+        self._critic_parameters: list[th.Tensor] = []
+        self._target_parameters: list[th.Tensor] = []
+        for role, (critic, target) in self.critic_pairs.items():
+            of_critic, of_target = list(critic.parameters()), list(target.parameters())
+            if len(of_critic) == len(self.flat_parameters[role].parameters):
+                self._flat_targets.append(FlatParameters(of_target))
+                of_critic, of_target = [self.flat_parameters[role].flat], [self._flat_targets[-1].flat]
+            self._critic_parameters += of_critic
+            self._target_parameters += of_target
+        self._has_statistics = any(get_parameters_by_name(critic, ["running_"]) for critic, _ in self.critic_pairs.values())
+
+    def refresh_parameters(self) -> None:
+        """To be called before training: see :meth:`FlatParameters.refresh`."""
+        for parameters in (*self.flat_parameters.values(), *self._flat_targets):
+            parameters.refresh()
 
     @property
     def actor(self) -> DeployedPolicy:
@@ -169,10 +184,10 @@ class AsymmetricPolicy(BasePolicy):
         return getattr(self, self.roles.deployed)
 
     @property
-    def critic_pairs(self) -> list[tuple[CriticEnsemble, CriticEnsemble]]:
-        """(critic, target) of each critic that there is."""
+    def critic_pairs(self) -> dict[str, tuple[CriticEnsemble, CriticEnsemble]]:
+        """Role -> (critic, target), for each critic that there is."""
         critics = [role for role in self.roles.others if role.endswith("critic") and getattr(self, role) is not None]
-        return [(getattr(self, role), getattr(self, f"{role}_target")) for role in critics]
+        return {role: (getattr(self, role), getattr(self, f"{role}_target")) for role in critics}
 
     def update_targets(self, tau: float) -> None:
         """
@@ -183,7 +198,7 @@ class AsymmetricPolicy(BasePolicy):
         polyak_average(self._critic_parameters, self._target_parameters, tau)
         if not self._has_statistics:
             return
-        for critic, target in self.critic_pairs:  # not collected once: a move to another device replaces buffers
+        for critic, target in self.critic_pairs.values():  # not collected once: a move to another device replaces buffers
             polyak_average(get_parameters_by_name(critic, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
 
     # --- acting -----------------------------------------------------------------------------------------------------
@@ -244,7 +259,7 @@ class AsymmetricPolicy(BasePolicy):
 
         :param mode: True for training
         """
-        for role in self.network_parameters:
+        for role in self.flat_parameters:
             getattr(self, role).set_training_mode(mode)
         self.training = mode
 

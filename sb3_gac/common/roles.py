@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from gymnasium import spaces
 
+from sb3_gac.common.checks import check_positive
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 
 RoleKeys = Mapping[str, Sequence[str]]
@@ -25,6 +26,11 @@ class Roles(NamedTuple):
     def all(self) -> tuple[str, ...]:
         """Every role, the deployed one first."""
         return (self.deployed, *self.others)
+
+    @property
+    def policies(self) -> list[str]:
+        """All but the critics."""
+        return [role for role in self.all if not role.endswith("critic")]
 
 
 def check_observation_space(observation_space: spaces.Space) -> spaces.Dict:
@@ -98,7 +104,7 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
         net_arch = [256, 256]
     if isinstance(net_arch, list):
         return dict.fromkeys(roles.all, net_arch)
-    policies = [role for role in roles.all if not role.endswith("critic")]
+    policies = roles.policies
     if set(net_arch) == {"pi", "qf"}:
         net_arch = {**dict.fromkeys(policies, net_arch["pi"]), "critic": net_arch["qf"]}
     if set(net_arch) != {*policies, "critic"}:
@@ -107,3 +113,22 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
             f"got {net_arch!r}."
         )
     return {role: net_arch[role if role in policies else "critic"] for role in roles.all}
+
+
+def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> dict[str, float]:
+    """
+    Learning rates per role.
+
+    :param roles: of the algorithm
+    :param lr_scales: role, or "critic" for all critics -> multiple of the learning rate, where it is not 1
+    :return: role -> multiple, for all roles
+    :raises ValueError: if a role is unknown or a multiple is not a number above 0
+    """
+    lr_scales = dict(lr_scales or {})
+    unknown_roles = sorted(set(lr_scales) - {*roles.all, "critic"})
+    if unknown_roles:
+        raise ValueError(f'lr_scales names unknown roles {unknown_roles}; the roles are {[*roles.all, "critic"]}.')
+    for role, scale in lr_scales.items():
+        check_positive(f'lr_scales["{role}"]', scale)
+    default = {role: 1.0 if role in roles.policies else lr_scales.get("critic", 1.0) for role in roles.all}
+    return {role: lr_scales.get(role, default[role]) for role in roles.all}

@@ -3,11 +3,10 @@
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.common.losses import distillation_loss
 from sb3_gac.gac.gac import GAC
-from sb3_gac.gac.policies import ActionDistributions
+from sb3_gac.gac.update import StepInputs
 
 
 class GACShare(GAC):
@@ -20,5 +19,5 @@ class GACShare(GAC):
 class GACWithoutQ(GACShare):
     """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14)."""
 
-    def _learner_loss(self, obs: PyTorchObs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
-        return distillation_loss(self._kl(now.guider.detach(), now.learner))
+    def _learner_loss(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
+        return distillation_loss(self._kl(inputs.now.guider.detach(), inputs.now.learner))

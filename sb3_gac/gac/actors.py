@@ -4,7 +4,6 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
-from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy, RolePolicy
 from sb3_gac.common.distributions import TanhGaussian, project_to_kl_ball
@@ -27,10 +26,6 @@ class Learner(DeployedPolicy):
         """
         latent = self.latent(obs)
         return self.mean(latent), self.bounded_log_std(latent.detach())
-
-    def mean_parameters(self) -> list[nn.Parameter]:
-        """All parameters but those of the deployment log-std head, whose loss is another."""
-        return [parameter for name, parameter in self.named_parameters() if not name.startswith("log_std.")]
 
 
 class Guider(RolePolicy):

@@ -1,7 +1,6 @@
 """Guided Actor-Critic."""
 
-import math
-from functools import partial
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -9,35 +8,21 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_gac.common.checks import check_choice, check_not_negative, check_positive
-from sb3_gac.common.distributions import KL_REDUCTIONS, TanhGaussian, kl_shared_std
-from sb3_gac.common.dual import Coefficient, make_coefficient
-from sb3_gac.common.losses import (
-    guided_target,
-    guider_loss,
-    learner_loss,
-    learner_target,
-    log_std_loss,
-)
-from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm, Batch, Metrics
+from sb3_gac.common.distributions import KL_REDUCTIONS
+from sb3_gac.common.dual import make_coefficient
 from sb3_gac.common.roles import RoleKeys
 from sb3_gac.gac.actors import GUIDERS
-from sb3_gac.gac.policies import ActionDistributions, ActorOutputs, GACPolicy, MultiInputPolicy
+from sb3_gac.gac.policies import GACPolicy, MultiInputPolicy
+from sb3_gac.gac.update import GuidedUpdate
 
 KL_COEF_START = 1.0
 
 
-def _on_both(network: th.nn.Module, batch: Batch) -> tuple[ActorOutputs, ActorOutputs]:
-    """A policy's outputs on the observations, and, as constants, on the next ones."""
-    now = network(batch.observations)
-    with th.no_grad():
-        return now, network(batch.next_observations)
-
-
-class GAC(AsymmetricOffPolicyAlgorithm):
+class GAC(GuidedUpdate):
     """
     Guided Actor-Critic: a guider that sees everything collects the data, a learner that sees ``partial`` alone is
     pulled towards it by a KL constraint and by critics of its own. ``predict`` is the learner.
@@ -68,7 +53,6 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     :param kl_coef_learning_rate: of a learned ``kl_coef``
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
     :param guider: "residual": learner plus a privileged correction; "independent": a network of its own (the paper's)
-    :param guider_lr_scale: the guider's learning rate as a multiple of ``learning_rate``
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
         is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
@@ -76,6 +60,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     :param learner_entropy: SAC's entropy term in the learner's objective and critics, without which its mean drifts
         into saturation; False for eqs. 15 and 16 as printed
     :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
+    :param lr_scales: network -> multiple of ``learning_rate``, such as ``{"critic": 3.0}`` or ``{"guider": 0.3}``
     :param role_keys: role -> observation entries, by default ``partial`` for the learner and all for the others
     :param stats_window_size: episodes averaged in rollout statistics
     :param tensorboard_log: log directory, ``None`` for no log
@@ -87,7 +72,6 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
-    policy: GACPolicy
 
     def __init__(
         self,
@@ -115,11 +99,11 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         kl_coef_learning_rate: float = 3e-3,
         kl_reduction: str = "mean",
         guider: str = "residual",
-        guider_lr_scale: float = 1.0,
         max_kl: float | None = None,
         learner_kl_scale: str | float = "auto",
         learner_entropy: bool = True,
         max_grad_norm: float | None = 1.0,
+        lr_scales: Mapping[str, float] | None = None,
         role_keys: RoleKeys | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -136,6 +120,7 @@ class GAC(AsymmetricOffPolicyAlgorithm):
             target_entropy=target_entropy,
             target_update_interval=target_update_interval,
             max_grad_norm=max_grad_norm,
+            lr_scales=lr_scales,
             role_keys=role_keys,
             learning_rate=learning_rate,
             buffer_size=buffer_size,
@@ -163,7 +148,6 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         self.kl_coef_learning_rate = kl_coef_learning_rate
         self.kl_reduction = kl_reduction
         self.guider = guider
-        self.guider_lr_scale = guider_lr_scale
         self.max_kl = max_kl
         self.learner_kl_scale = learner_kl_scale
         self.learner_entropy = learner_entropy
@@ -177,7 +161,6 @@ class GAC(AsymmetricOffPolicyAlgorithm):
         if not callable(self.target_kl):
             check_positive("target_kl", self.target_kl, remedy="for example the default 0.0033")
         check_positive("kl_coef_learning_rate", self.kl_coef_learning_rate)
-        check_positive("guider_lr_scale", self.guider_lr_scale)
         check_choice("kl_reduction", self.kl_reduction, KL_REDUCTIONS)
         check_choice("guider", self.guider, GUIDERS)
         if self.max_kl is not None:
@@ -189,7 +172,6 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     def _policy_options(self) -> dict[str, Any]:
         return super()._policy_options() | {
             "guider": self.guider,
-            "guider_lr_scale": self.guider_lr_scale,
             "max_kl": self.max_kl,
             "kl_reduction": self.kl_reduction,
         }
@@ -197,127 +179,9 @@ class GAC(AsymmetricOffPolicyAlgorithm):
     def _setup_coefficients(self) -> None:
         super()._setup_coefficients()
         self.target_kl_schedule = FloatSchedule(self.target_kl)
-        self.kl_coef_dual: Coefficient = make_coefficient(
+        self.kl_coef_dual = make_coefficient(
             "kl_coef", self.kl_coef, KL_COEF_START, self.kl_coef_bounds, self.kl_coef_learning_rate, self.device
         )
-
-    # --- one gradient step (Algorithm 1) ----------------------------------------------------------------------------
-
-    def _gradient_step(self, batch: Batch) -> Metrics:
-        """
-        Guider and learner each fit their critics (eqs. 12, 15) and then climb them (eqs. 13, 16); then beta and alpha.
-
-        The halves share nothing that either changes, so they may run at once. The targets follow in :meth:`train`.
-        """
-        now, later = self._run_policies(batch)
-        noise = th.randn((4, *now.learner.mean.shape), device=self.device)
-        guider_half = partial(self._guider_half, batch, now, later, noise[:2])
-        learner_half = partial(self._learner_half, batch, now, later, noise[2:])
-        (metrics, kl, log_prob), learner_metrics = self._run_halves([guider_half, learner_half])
-        ent_metrics = self.ent_coef_dual.update(log_prob + float(self.target_entropy))
-        kl_metrics = self.kl_coef_dual.update(kl - self.current_target_kl)
-        metrics |= learner_metrics
-        metrics |= {f"ent_coef_{name}": value for name, value in ent_metrics.items() if name == "loss"}
-        metrics |= {f"kl_coef_{name}": value for name, value in kl_metrics.items()}
-        return metrics | self._policy_diagnostics(now, kl, log_prob)
-
-    @property
-    def current_target_kl(self) -> float:
-        """The bound on KL at this point of training."""
-        return self.target_kl_schedule(self._current_progress_remaining)
-
-    def _run_policies(self, batch: Batch) -> tuple[ActionDistributions, ActionDistributions]:
-        """Both policies on the observations, and, as constants, on the next ones."""
-        guider, learner = self._run_halves(
-            [partial(_on_both, self.policy.guider, batch), partial(_on_both, self.policy.learner, batch)]
-        )
-        now, later = (self.policy.combine(*outputs) for outputs in zip(guider, learner, strict=True))
-        return now, later
-
-    def _guider_half(
-        self, batch: Batch, now: ActionDistributions, later: ActionDistributions, noise: th.Tensor
-    ) -> tuple[Metrics, th.Tensor, th.Tensor]:
-        """
-        Eqs. 12 and 13.
-
-        :param batch: B transitions
-        :param now: the policies on the observations
-        :param later: the policies on the next observations
-        :param noise: standard normal, for the next action and for the present one, shape (2, B, A)
-        :return: metrics; KL(guider || learner) and the guider's log-probability, detached, each of shape (B,)
-        """
-        metrics = self._fit_critics("guider_critic", batch, self._guided_target(batch, later, noise[0]))
-        action, log_prob = now.guider.sample_with_log_prob(noise[1])
-        kl = self._kl(now.guider, now.learner.detach())
-        q = self.policy.guider_critic(batch.observations, action)
-        loss = guider_loss(kl, log_prob, q, self.kl_coef_dual.value, self.ent_coef_dual.value)
-        return metrics | self._descend("guider", loss), kl.detach(), log_prob.detach()
-
-    @th.no_grad()
-    def _guided_target(self, batch: Batch, later: ActionDistributions, noise: th.Tensor) -> th.Tensor:
-        """Eq. 12, shape (B,)."""
-        action, log_prob = later.guider.sample_with_log_prob(noise)
-        next_q = self.policy.guider_critic_target(batch.next_observations, action)
-        next_kl = self._kl(later.guider, later.learner)
-        coefficients = (self.kl_coef_dual.value, self.ent_coef_dual.value)
-        return guided_target(batch.rewards, batch.dones, next_q, next_kl, log_prob, *coefficients, batch.discounts)
-
-    def _learner_half(self, batch: Batch, now: ActionDistributions, later: ActionDistributions, noise: th.Tensor) -> Metrics:
-        """
-        Eqs. 15 and 16, and the fit of the std for deployment. Arguments are those of :meth:`_guider_half`.
-        """
-        metrics: Metrics = {}
-        if self.policy.learner_critic is not None:
-            metrics = self._fit_critics("learner_critic", batch, self._learner_target(batch, later, noise[0]))
-        loss = self._learner_loss(batch.observations, now, noise[1])
-        deployment_loss = log_std_loss(now.deployment_log_std, now.learner.log_std)
-        metrics |= self._descend("learner", loss, deployment_loss)
-        return metrics | {"log_std_loss": deployment_loss.detach()}
-
-    @th.no_grad()
-    def _learner_target(self, batch: Batch, later: ActionDistributions, noise: th.Tensor) -> th.Tensor:
-        """Eq. 15, shape (B,)."""
-        action, log_prob = later.learner.sample_with_log_prob(noise)
-        next_q = self.policy.critic_target(batch.next_observations, action)
-        return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, self._learner_ent_coef)
-
-    def _learner_loss(self, obs: PyTorchObs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
-        """
-        Eq. 16, with the learner's critics, or the guided ones where it has none.
-
-        :param obs: full observation, B of each entry
-        :param now: the policies on it
-        :param noise: standard normal, shape (B, A)
-        :return: scalar
-        """
-        action, log_prob = now.learner.sample_with_log_prob(noise)
-        q = self.policy.critic(obs, action)
-        kl: th.Tensor | float = 0.0
-        if self.learner_kl_scale:
-            kl = float(self.learner_kl_scale) * self._kl(now.guider.detach(), now.learner)
-        return learner_loss(kl, q, self.kl_coef_dual.value, log_prob, self._learner_ent_coef)
-
-    @property
-    def _learner_ent_coef(self) -> th.Tensor | float:
-        return self.ent_coef_dual.value if self.learner_entropy else 0.0
-
-    def _kl(self, guider: TanhGaussian, learner: TanhGaussian) -> th.Tensor:
-        """KL(guider || learner) with the std that ``learner`` borrowed, shape (B,)."""
-        return kl_shared_std(guider.mean, learner.mean, learner.log_std.exp(), self.kl_reduction)
-
-    def _policy_diagnostics(self, now: ActionDistributions, kl: th.Tensor, log_prob: th.Tensor) -> Metrics:
-        target = self.current_target_kl
-        return {
-            "std": now.learner.log_std.exp().mean(),
-            "learner_mean_abs": now.learner.mean.detach().abs().mean(),
-            "kl": kl.mean(),
-            "kl_p95": kl.kthvalue(math.ceil(0.95 * kl.numel())).values,
-            "kl_above_target": (kl > target).float().mean(),
-            "target_kl": kl.new_full((), target),
-            "kl_coef": self.kl_coef_dual.value,
-            "ent_coef": self.ent_coef_dual.value,
-            "entropy": -log_prob.mean(),
-        }
 
     # --- SB3's contract ---------------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_gac.common.actors import LOG_STD_BOUNDS
 from sb3_gac.common.distributions import TanhGaussian
-from sb3_gac.common.networks import CriticEnsemble, trainable
+from sb3_gac.common.networks import CriticEnsemble
 from sb3_gac.common.policies import AsymmetricPolicy
 from sb3_gac.common.roles import Roles
 from sb3_gac.gac.actors import GUIDERS, Learner
@@ -49,7 +49,6 @@ class GACPolicy(AsymmetricPolicy):
     :param log_std_bounds: smallest and largest log standard deviation before tanh
     :param features_extractor_class: encoder, made once per role on the entries of that role
     :param features_extractor_kwargs: keyword arguments for it
-    :param guider_lr_scale: learning rate of the guider, as a multiple of that of the others
     :param share_features_extractor: whether guider and critics see the learner's features of its entries, as they are,
         and encode only the other entries themselves; the learner's loss trains that encoder (saves most of the work
         where ``partial`` is an image)
@@ -75,7 +74,6 @@ class GACPolicy(AsymmetricPolicy):
         max_kl: float | None = None,
         kl_reduction: str = "mean",
         learner_critics: bool = True,
-        guider_lr_scale: float = 1.0,
         log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
         **kwargs: Any,
     ):
@@ -85,7 +83,6 @@ class GACPolicy(AsymmetricPolicy):
             "max_kl": max_kl,
             "kl_reduction": kl_reduction,
             "learner_critics": learner_critics,
-            "guider_lr_scale": guider_lr_scale,
             "log_std_bounds": log_std_bounds,
         }
         self.learner = Learner(**self._role_kwargs("learner"), log_std_bounds=log_std_bounds)
@@ -96,8 +93,8 @@ class GACPolicy(AsymmetricPolicy):
         self.learner_critic, self.learner_critic_target = None, None
         if learner_critics:
             self.learner_critic, self.learner_critic_target = self._make_critic_and_target("learner_critic", shared)
-        self._finish(lr_schedule, {"guider": guider_lr_scale})
-        self.clipped_parameters = self.network_parameters | {"learner": trainable(self.learner.mean_parameters())}
+        deployment_head = len(list(self.learner.log_std.parameters()))
+        self._finish(lr_schedule, unclipped=deployment_head)
 
     @property
     def critic(self) -> CriticEnsemble:

@@ -11,7 +11,9 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_gac import GAC, GACShare, GACWithoutQ, preset
 from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.common.off_policy import Batch
 from sb3_gac.gac.policies import ActionDistributions
+from sb3_gac.gac.update import StepInputs
 from tests.helpers import TwoViewBandit, small_model
 
 LOGGED = {
@@ -24,6 +26,12 @@ LOGGED = {
 
 def _numpy_state(policy):
     return {name: p.detach().double().numpy() for name, p in policy.named_parameters()}
+
+
+def _inputs(obs, now, kl_coef=1.0, ent_coef=1.0):
+    """Of a gradient step, as far as the policies' losses look at them."""
+    batch = Batch(obs, None, None, obs, None, 0.99)
+    return StepInputs(batch, now, now, th.tensor(kl_coef), th.tensor(ent_coef))
 
 
 def _mlp(x, weights, prefix, heads):
@@ -61,9 +69,9 @@ def test_critic_targets_match_an_independent_computation(guider, learner_entropy
     batch = model._sample_batch(32)
     th.manual_seed(5)
     noise = th.randn(2, 32, 1)
-    later = model.policy.distributions(batch.next_observations)
-    guided = model._guided_target(batch, later, noise[0]).double().numpy()
-    of_learner = model._learner_target(batch, later, noise[1]).double().numpy()
+    inputs = model._run_policies(batch)
+    guided = model._guided_target(inputs, noise[0]).double().numpy()
+    of_learner = model._learner_target(inputs, noise[1]).double().numpy()
 
     guider_noise, learner_noise = noise.double().numpy()
     weights = _numpy_state(model.policy)
@@ -135,7 +143,7 @@ def test_logged_values_are_means_over_the_gradient_steps():
     model.learn(30)
     history = []
     original = model._gradient_step
-    model._gradient_step = lambda batch: history.append(original(batch)) or history[-1]
+    model._gradient_step = lambda *args: history.append(original(*args)) or history[-1]
     model.train(gradient_steps=5, batch_size=8)
     logged = model.logger.name_to_value
     for name in ("guider_critic_loss", "learner_critic_loss", "learner_loss"):
@@ -143,6 +151,8 @@ def test_logged_values_are_means_over_the_gradient_steps():
     assert logged["train/critic_loss"] == logged["train/guider_critic_loss"] + logged["train/learner_critic_loss"]
     assert logged["train/actor_loss"] == logged["train/learner_loss"]
     assert logged["train/kl_coef"] == 0.5
+    assert [("kl_p95" in step) for step in history] == [False] * 4 + [True], "diagnostics on the last step alone"
+    assert logged["train/kl_p95"] == history[-1]["kl_p95"].item()
 
 
 def test_targets_follow_at_their_interval():
@@ -204,8 +214,8 @@ def test_kl_settles_at_its_target():
     kls = []
     original = model._gradient_step
 
-    def spy(batch):
-        metrics = original(batch)
+    def spy(*args):
+        metrics = original(*args)
         kls.append(metrics["kl"].item())
         return metrics
 
@@ -254,7 +264,7 @@ def test_learner_objective_matches_an_independent_computation(learner_entropy):
     with th.no_grad():  # a guider that differs from its learner
         model.policy.guider.mean.bias.add_(0.3)
     now, noise = model.policy.distributions(obs), th.randn(32, 1)
-    loss = model._learner_loss(obs, now, noise).item()
+    loss = model._learner_loss(_inputs(obs, now, kl_coef=0.7, ent_coef=0.2), noise).item()
     tensors = (noise, now.learner.mean, now.learner.log_std.exp(), now.guider.mean)
     noise, mean, std, guider_mean = (x.detach().double().numpy() for x in tensors)
     kl = (((guider_mean - mean) / std) ** 2 / 2)[:, 0]
@@ -269,7 +279,7 @@ def test_without_q_the_learner_imitates_and_nothing_else():
     model = small_model(cls=GACWithoutQ)
     learner = TanhGaussian(th.zeros(2, 1), th.full((2, 1), math.log(0.5)))
     guider = TanhGaussian(th.tensor([[0.2], [0.4]]), learner.log_std)
-    loss = model._learner_loss({}, ActionDistributions(guider, learner, learner.log_std), th.randn(2, 1))
+    loss = model._learner_loss(_inputs({}, ActionDistributions(guider, learner, learner.log_std)), th.randn(2, 1))
     assert loss.item() == pytest.approx(0.5 * (0.4**2 + 0.8**2) / 2)
 
 
@@ -306,18 +316,20 @@ def test_target_entropy_conventions():
 def test_optimizers_are_where_sac_has_them():
     model = small_model()
     for network in (model.actor, model.critic):
-        optimised = [id(p) for group in network.optimizer.param_groups for p in group["params"]]
-        assert optimised == [id(p) for p in network.parameters()]
+        (flat,) = network.optimizer.param_groups[0]["params"]
+        th.testing.assert_close(flat, th.cat([p.flatten() for p in network.parameters()]), rtol=0, atol=0)
     assert model.policy.net_arch == [16]
 
 
-def test_the_guider_learns_at_its_own_rate():
-    model = small_model(learning_rate=LinearSchedule(1e-3, 0.0, 1.0), guider_lr_scale=3.0)
+def test_networks_learn_at_rates_of_their_own():
+    scales = {"guider": 3.0, "critic": 2.0, "learner_critic": 5.0}
+    model = small_model(learning_rate=LinearSchedule(1e-3, 5e-4, 1.0), lr_scales=scales)
     model.learn(50)
-    rates = [network.optimizer.param_groups[0]["lr"] for network in (model.policy.guider, model.policy.learner)]
-    assert rates[0] == pytest.approx(3 * rates[1])
-    assert rates[1] == pytest.approx(model.lr_schedule(model._current_progress_remaining))
-    assert rates[1] < 1e-3
+    networks = ("learner", "guider", "guider_critic", "learner_critic")
+    rates = [getattr(model.policy, network).optimizer.param_groups[0]["lr"] for network in networks]
+    assert rates[0] == pytest.approx(model.lr_schedule(model._current_progress_remaining))
+    assert 0 < rates[0] < 1e-3
+    assert np.array(rates) / rates[0] == pytest.approx([1.0, 3.0, 2.0, 5.0])
 
 
 @pytest.mark.parametrize(("guider", "scale"), [("residual", 0.0), ("independent", 1.0)])

@@ -8,7 +8,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from sb3_gac import GAC, GACShare, GACWithoutQ
 from sb3_gac.common.distributions import TanhGaussian
 from sb3_gac.common.losses import critic_loss, distillation_loss, guider_loss, learner_loss, log_std_loss
-from tests.helpers import optimizers_of, small_model
+from tests.helpers import small_model
 
 
 def _observations(n=8):
@@ -98,11 +98,10 @@ def _filled(cls, **arguments):
 def test_updates_leave_the_other_networks_bit_for_bit(cls, critics):
     model = _filled(cls)
     batch = model._sample_batch(32)
-    now, later = model._run_policies(batch)
-    noise = th.randn(2, 32, 1)
+    inputs, noise = model._run_policies(batch), th.randn(2, 32, 1)
     own = critics & {"learner_critic"}
-    assert _changed_parts(model, lambda: model._guider_half(batch, now, later, noise)) == {"guider", "guider_critic"}
-    assert _changed_parts(model, lambda: model._learner_half(batch, now, later, noise)) == {"learner"} | own
+    assert _changed_parts(model, lambda: model._guider_half(inputs, noise)) == {"guider", "guider_critic"}
+    assert _changed_parts(model, lambda: model._learner_half(inputs, noise)) == {"learner"} | own
     targets = {f"{name}_target" for name in critics}
     assert _changed_parts(model, lambda: model.policy.update_targets(0.5)) == targets
 
@@ -111,11 +110,11 @@ def test_updates_leave_the_other_networks_bit_for_bit(cls, critics):
 def test_policy_updates_leave_no_gradient_in_the_critics(cls):
     model = _filled(cls)
     batch = model._sample_batch(32)
-    now, _ = model._run_policies(batch)
-    q = model.policy.guider_critic(batch.observations, now.guider.sample()).mean()
+    inputs = model._run_policies(batch)
+    q = model.policy.guider_critic(batch.observations, inputs.now.guider.sample()).mean()
     model._descend("guider", -q)
-    model._descend("learner", model._learner_loss(batch.observations, now, th.randn(32, 1)))
-    assert all(p.grad is None for critic, _ in model.policy.critic_pairs for p in critic.parameters())
+    model._descend("learner", model._learner_loss(inputs, th.randn(32, 1)))
+    assert all(p.grad is None for critic, _ in model.policy.critic_pairs.values() for p in critic.parameters())
 
 
 def test_learner_has_no_gradient_with_respect_to_privileged():
@@ -149,10 +148,21 @@ def test_guider_does_depend_on_privileged():
 def test_the_log_std_head_has_no_say_in_the_clipping_of_the_learner():
     """Its gradient belongs to another loss: a huge one must not shrink the learner's."""
     model = _filled(GAC, max_grad_norm=1.0)
-    head = {id(p) for p in model.policy.learner.log_std.parameters()}
-    names = {name for name, p in model.policy.learner.named_parameters() if id(p) in head}
-    assert names == {"log_std.weight", "log_std.bias"}
-    assert head.isdisjoint(id(p) for p in model.policy.learner.mean_parameters())
+    head = list(model.policy.learner.log_std.parameters())
+    flat = model.policy.flat_parameters["learner"]
+    assert [id(p) for p in flat.parameters[-2:]] == [id(p) for p in head]
+    obs = _observations()
+    mean, log_std = model.policy.learner(obs)
+    flat.backward(0.01 * mean.sum())
+    alone = flat.flat.grad.clone()
+    assert 0 < alone.norm() < 1, "not clipped by itself"
+    mean, log_std = model.policy.learner(obs)
+    flat.backward(0.01 * mean.sum() + 1e6 * log_std.sum())
+    norm = flat.clip_gradient(1.0)
+    n_head = sum(p.numel() for p in head)
+    assert norm.item() == pytest.approx(alone.norm().item(), rel=1e-6)
+    th.testing.assert_close(flat.flat.grad[:-n_head], alone[:-n_head])
+    assert flat.flat.grad[-n_head:].norm() > 1e5, "its own is left as it is"
 
 
 class TestSharedEncoder:
@@ -185,23 +195,22 @@ class TestSharedEncoder:
         batch = model._sample_batch(32)
         encoder = model.policy.learner.features_extractor.linear.weight
         before = encoder.detach().clone()
-        now, later = model._run_policies(batch)
-        noise = th.randn(2, 32, 1)
-        model._guider_half(batch, now, later, noise)
-        model._fit_critics("learner_critic", batch, model._learner_target(batch, later, noise[0]))
+        inputs, noise = model._run_policies(batch), th.randn(2, 32, 1)
+        model._guider_half(inputs, noise)
+        model._fit_critics("learner_critic", batch, model._learner_target(inputs, noise[0]))
         assert th.equal(encoder, before)
-        model._learner_half(batch, now, later, noise)
+        model._learner_half(inputs, noise)
         assert not th.equal(encoder, before)
         guider = model.policy.distributions(batch.observations).guider
         assert "learner" not in _reached(model.policy, guider.mean.sum() + guider.log_std.sum())
 
     def test_is_optimised_once_and_followed_by_the_targets(self, model):
-        optimised = [id(p) for opt in optimizers_of(model.policy) for group in opt.param_groups for p in group["params"]]
+        optimised = [id(p) for flat in model.policy.flat_parameters.values() for p in flat.parameters]
         assert len(optimised) == len(set(optimised))
         assert id(model.policy.learner.features_extractor.linear.weight) in optimised
         model._gradient_step(model._sample_batch(32))
         model.policy.update_targets(1.0)
-        critic, target = model.policy.critic_pairs[1]
+        critic, target = model.policy.critic_pairs["learner_critic"]
         assert all(th.equal(p, q) for p, q in zip(critic.parameters(), target.parameters(), strict=True))
 
     def test_saves_and_loads(self, model, tmp_path):

@@ -1,0 +1,170 @@
+"""One gradient step of Guided Actor-Critic: Algorithm 1."""
+
+import math
+from typing import NamedTuple
+
+import torch as th
+from stable_baselines3.common.utils import FloatSchedule
+
+from sb3_gac.common.distributions import TanhGaussian, kl_shared_std
+from sb3_gac.common.dual import Coefficient
+from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target, log_std_loss
+from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm, Batch, Metrics
+from sb3_gac.gac.policies import ActionDistributions, ActorOutputs, GACPolicy
+
+
+class StepInputs(NamedTuple):
+    """
+    What both halves of a gradient step read and neither changes.
+
+    :param batch: B transitions
+    :param now: the policies on the observations
+    :param later: the policies on the next observations, as constants
+    :param kl_coef: alpha
+    :param ent_coef: beta
+    """
+
+    batch: Batch
+    now: ActionDistributions
+    later: ActionDistributions
+    kl_coef: th.Tensor
+    ent_coef: th.Tensor
+
+
+def _on_both(network: th.nn.Module, batch: Batch) -> tuple[ActorOutputs, ActorOutputs]:
+    """A policy's outputs on the observations, and, as constants, on the next ones."""
+    now = network(batch.observations)
+    with th.no_grad():
+        return now, network(batch.next_observations)
+
+
+class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
+    """
+    Guider and learner each fit their critics (eqs. 12, 15) and then climb them (eqs. 13, 16); then beta and alpha follow.
+
+    The attributes below are set by :class:`sb3_gac.GAC`, where they are described.
+    """
+
+    policy: GACPolicy
+    kl_coef_dual: Coefficient
+    kl_reduction: str
+    target_kl_schedule: FloatSchedule
+    learner_kl_scale: str | float
+    learner_entropy: bool
+
+    def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
+        """The two halves share nothing that either changes, so they may run at once; the targets follow in :meth:`train`."""
+        inputs = self._run_policies(batch)
+        noise = th.randn((4, *inputs.now.learner.mean.shape), device=self.device)
+        (guider_metrics, kl, log_prob), learner_metrics = self._run_halves(
+            [lambda: self._guider_half(inputs, noise[:2]), lambda: self._learner_half(inputs, noise[2:])]
+        )
+        metrics = guider_metrics | learner_metrics
+        metrics["ent_coef_loss"] = self.ent_coef_dual.update(log_prob + float(self.target_entropy))
+        metrics["kl_coef_loss"] = self.kl_coef_dual.update(kl - self.current_target_kl)
+        metrics["kl"] = kl.mean()
+        return metrics | self._diagnostics(inputs, kl, log_prob) if diagnose else metrics
+
+    @property
+    def current_target_kl(self) -> float:
+        """The bound on KL at this point of training."""
+        return self.target_kl_schedule(self._current_progress_remaining)
+
+    def _run_policies(self, batch: Batch) -> StepInputs:
+        guider, learner = self._run_halves(
+            [lambda: _on_both(self.policy.guider, batch), lambda: _on_both(self.policy.learner, batch)]
+        )
+        now, later = (self.policy.combine(*outputs) for outputs in zip(guider, learner, strict=True))
+        return StepInputs(batch, now, later, self.kl_coef_dual.value, self.ent_coef_dual.value)
+
+    # --- the guider's half ------------------------------------------------------------------------------------------
+
+    def _guider_half(self, inputs: StepInputs, noise: th.Tensor) -> tuple[Metrics, th.Tensor, th.Tensor]:
+        """
+        Eqs. 12 and 13.
+
+        :param inputs: of this step
+        :param noise: standard normal, for the next action and for the present one, shape (2, B, A)
+        :return: metrics; KL(guider || learner) and the guider's log-probability, detached, each of shape (B,)
+        """
+        batch, now = inputs.batch, inputs.now
+        metrics = self._fit_critics("guider_critic", batch, self._guided_target(inputs, noise[0]))
+        action, log_prob = now.guider.sample_with_log_prob(noise[1])
+        kl = self._kl(now.guider, now.learner.detach())
+        q = self.policy.guider_critic(batch.observations, action)
+        loss = guider_loss(kl, log_prob, q, inputs.kl_coef, inputs.ent_coef)
+        return metrics | self._descend("guider", loss), kl.detach(), log_prob.detach()
+
+    @th.no_grad()
+    def _guided_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
+        """Eq. 12, shape (B,)."""
+        batch, later = inputs.batch, inputs.later
+        action, log_prob = later.guider.sample_with_log_prob(noise)
+        next_q = self.policy.guider_critic_target(batch.next_observations, action)
+        next_kl = self._kl(later.guider, later.learner)
+        coefficients = (inputs.kl_coef, inputs.ent_coef)
+        return guided_target(batch.rewards, batch.dones, next_q, next_kl, log_prob, *coefficients, batch.discounts)
+
+    # --- the learner's half -----------------------------------------------------------------------------------------
+
+    def _learner_half(self, inputs: StepInputs, noise: th.Tensor) -> Metrics:
+        """
+        Eqs. 15 and 16, and the fit of the std for deployment.
+
+        :param inputs: of this step
+        :param noise: standard normal, for the next action and for the present one, shape (2, B, A)
+        :return: metrics
+        """
+        metrics: Metrics = {}
+        if self.policy.learner_critic is not None:
+            metrics = self._fit_critics("learner_critic", inputs.batch, self._learner_target(inputs, noise[0]))
+        deployment_loss = log_std_loss(inputs.now.deployment_log_std, inputs.now.learner.log_std)
+        metrics |= self._descend("learner", self._learner_loss(inputs, noise[1]), deployment_loss)
+        return metrics | {"log_std_loss": deployment_loss.detach()}
+
+    @th.no_grad()
+    def _learner_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
+        """Eq. 15, shape (B,)."""
+        batch = inputs.batch
+        action, log_prob = inputs.later.learner.sample_with_log_prob(noise)
+        next_q = self.policy.critic_target(batch.next_observations, action)
+        return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, self._learner_ent_coef(inputs))
+
+    def _learner_loss(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
+        """
+        Eq. 16, with the learner's critics, or the guided ones where it has none.
+
+        :param inputs: of this step
+        :param noise: standard normal, shape (B, A)
+        :return: scalar
+        """
+        now = inputs.now
+        action, log_prob = now.learner.sample_with_log_prob(noise)
+        q = self.policy.critic(inputs.batch.observations, action)
+        kl: th.Tensor | float = 0.0
+        if self.learner_kl_scale:
+            kl = float(self.learner_kl_scale) * self._kl(now.guider.detach(), now.learner)
+        return learner_loss(kl, q, inputs.kl_coef, log_prob, self._learner_ent_coef(inputs))
+
+    def _learner_ent_coef(self, inputs: StepInputs) -> th.Tensor | float:
+        return inputs.ent_coef if self.learner_entropy else 0.0
+
+    # --- both -------------------------------------------------------------------------------------------------------
+
+    def _kl(self, guider: TanhGaussian, learner: TanhGaussian) -> th.Tensor:
+        """KL(guider || learner) with the std that ``learner`` borrowed, shape (B,)."""
+        return kl_shared_std(guider.mean, learner.mean, learner.log_std.exp(), self.kl_reduction)
+
+    def _diagnostics(self, inputs: StepInputs, kl: th.Tensor, log_prob: th.Tensor) -> Metrics:
+        target, learner = self.current_target_kl, inputs.now.learner
+        return {
+            "kl_p95": kl.kthvalue(math.ceil(0.95 * kl.numel())).values,
+            "kl_above_target": (kl > target).float().mean(),
+            "target_kl": kl.new_full((), target),
+            "kl_coef": self.kl_coef_dual.value,
+            "kl_coef_on_bound": self.kl_coef_dual.on_bound(),
+            "ent_coef": self.ent_coef_dual.value,
+            "entropy": -log_prob.mean(),
+            "std": learner.log_std.exp().mean(),
+            "learner_mean_abs": learner.mean.detach().abs().mean(),
+        }
