@@ -3,9 +3,9 @@ How fast is a gradient step, and how large the buffer, beside SB3's SAC in the s
 
     python -m benchmarks.speed --out benchmarks/results/speed [--threads 1 2] [--quick]
 
-The contenders alternate in blocks, so that whatever else the machine does falls on all of them; ratios are medians of
-the blocks' ratios.  The limit is that of the arithmetic: the step's matrix products at the rate of a plain one, timed in
-the same run.  Only spaces and sizes of the tasks are used, with random data: physics has no part in it.
+The contenders alternate in blocks, each in a process of its own; ratios are medians of the blocks' ratios.  The limit is
+that of the arithmetic: the step's matrix products at the rate of a plain one, timed in the same run.  Steps and buffers use
+only spaces and sizes of the tasks, with random data; the rollout is that of HalfCheetah itself.
 """
 
 import argparse
@@ -21,13 +21,22 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 
 import sb3_gac
+from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.run import provenance
 
 SIZES = {"HalfCheetah": (8, 17, 6), "Ant": (13, 27, 8), "Humanoid": (169, 270, 17)}
-BLOCK, ROUNDS = 20, 9
+ALGORITHMS = {"gac": sb3_gac.GAC, "sac": SAC}
+BLOCK, ROUNDS = 20, 15
+ENVS = (1, 8, 128)
+GROWTH = [  # batch, width, size of the privileged entry
+    *((batch, 256, 17) for batch in (64, 256, 1024, 4096)),
+    *((256, width, 17) for width in (64, 128, 512, 1024)),
+    *((256, 256, privileged) for privileged in (9, 376, 1508)),
+]
 
 
 class SpacesOnly(gym.Env):
@@ -71,22 +80,16 @@ def make_model(algorithm: Any, sizes: tuple[int, int, int], batch: int, width: i
     return model.learn(2_000)
 
 
-def alternate(contenders: dict[str, Callable[[], Any]], block: int = BLOCK, rounds: int = ROUNDS) -> dict[str, list[float]]:
+def make_step(algorithm: str, sizes: tuple[int, int, int], batch: int, width: int) -> Callable[[], None]:
     """
-    :param contenders: name -> one step
-    :param block: steps per measurement
-    :param rounds: measurements of each
-    :return: name -> seconds per step, one number per round
+    :param algorithm: a key of ``ALGORITHMS``
+    :param sizes: partial, privileged, actions
+    :param batch: batch size
+    :param width: of the two hidden layers
+    :return: one gradient step, as ``learn`` makes it
     """
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(rounds + 1):  # the first warms up
-        for name, step in contenders.items():
-            step()  # what the others left in the caches and thread pools is not this one's
-            start = time.perf_counter()
-            for _ in range(block):
-                step()
-            seconds[name].append((time.perf_counter() - start) / block)
-    return {name: values[1:] for name, values in seconds.items()}
+    model = make_model(ALGORITHMS[algorithm], sizes, batch, width)
+    return lambda: model.train(1, batch)
 
 
 def step_flops(sizes: tuple[int, int, int], batch: int, width: int) -> float:
@@ -114,25 +117,30 @@ def step_flops(sizes: tuple[int, int, int], batch: int, width: int) -> float:
 def matmul_rate(batch: int, width: int) -> float:
     """Floating-point operations per second of one plain (B, H) x (H, H) product."""
     x, weight = th.randn(batch, width), th.randn(width, width)
-    seconds = alternate({"mm": lambda: th.mm(x, weight)}, block=100, rounds=5)["mm"]
+    seconds = alternate({"mm": timer(lambda: th.mm(x, weight))}, repetitions=100, rounds=5)["mm"]
     return 2.0 * batch * width * width / float(np.median(seconds))
 
 
-def compare_steps(sizes: tuple[int, int, int], batch: int, width: int, rounds: int) -> dict[str, float]:
+def compare_steps(sizes: tuple[int, int, int], batch: int, width: int, threads: int, rounds: int) -> dict[str, float]:
     """
-    :return: steps per second of both, GAC's over SAC's, and GAC's share of the arithmetic's limit
+    :return: gradient steps per second of each algorithm, GAC's over SAC's, and GAC's share of the arithmetic's limit
     """
-    gac, sac = (make_model(algorithm, sizes, batch, width) for algorithm in (sb3_gac.GAC, SAC))
-    seconds = alternate({"gac": lambda: gac.train(1, batch), "sac": lambda: sac.train(1, batch)}, rounds=rounds)
-    ratios = np.array(seconds["sac"]) / np.array(seconds["gac"])
+    repetitions = max(1, min(BLOCK, BLOCK * 256**3 // (batch * width**2)))
+    with process_timers(make_step, {name: (name, sizes, batch, width) for name in ALGORITHMS}, threads) as timers:
+        seconds = alternate(timers, repetitions, rounds)
+    th.set_num_threads(threads)
     limit = matmul_rate(batch, width) / step_flops(sizes, batch, width)
-    gac_rate = 1 / float(np.median(seconds["gac"]))
+    rates = {name: 1 / float(np.median(values)) for name, values in seconds.items()}
     return {
-        "gac_per_second": round(gac_rate, 1),
-        "sac_per_second": round(1 / float(np.median(seconds["sac"])), 1),
-        "gac_over_sac": round(float(np.median(ratios)), 3),
-        "gac_share_of_limit": round(gac_rate / limit, 3),
+        **{f"{name}_per_second": round(rate, 1) for name, rate in rates.items()},
+        "gac_over_sac": round(median_ratio(seconds["sac"], seconds["gac"]), 3),
+        "gac_share_of_limit": round(rates["gac"] / limit, 3),
     }
+
+
+def median_ratio(numerators: list[float], denominators: list[float]) -> float:
+    """Of two contenders' blocks, taken side by side."""
+    return float(np.median(np.array(numerators) / np.array(denominators)))
 
 
 def compare_buffers(sizes: tuple[int, int, int], batch: int = 256, capacity: int = 20_000) -> dict[str, float]:
@@ -152,31 +160,94 @@ def compare_buffers(sizes: tuple[int, int, int], batch: int = 256, capacity: int
         obs = following
     arrays = [*twice.observations.values(), *twice.next_observations.values()]
     arrays += [twice.actions, twice.rewards, twice.dones, twice.timeouts]
-    seconds = alternate({"compact": lambda: compact.sample(batch), "twice": lambda: twice.sample(batch)}, block=100)
-    ratios = np.array(seconds["compact"]) / np.array(seconds["twice"])
+    timers = {"compact": timer(lambda: compact.sample(batch)), "twice": timer(lambda: twice.sample(batch))}
+    seconds = alternate(timers, repetitions=100, rounds=9)
     return {
         "bytes_over_sb3": round(compact.nbytes() / sum(array.nbytes for array in arrays), 3),
-        "sampling_time_over_sb3": round(float(np.median(ratios)), 3),
+        "sampling_time_over_sb3": round(median_ratio(seconds["compact"], seconds["twice"]), 3),
         "sampling_microseconds": round(1e6 * float(np.median(seconds["compact"])), 1),
+    }
+
+
+def compare_wrappers(rounds: int = ROUNDS) -> dict[str, float]:
+    """
+    :return: microseconds of a HalfCheetah step, gymnasium's and ours with noise, and what ours adds as a share
+    """
+    envs = {"gymnasium": gym.make("HalfCheetah-v5"), "ours": gym.make("sb3_gac/HalfCheetah-v5", noise_std=0.1)}
+    seconds = alternate({name: timer(env_step(env)) for name, env in envs.items()}, repetitions=1_000, rounds=rounds)
+    return {
+        **{f"{name}_microseconds": round(1e6 * float(np.median(values)), 1) for name, values in seconds.items()},
+        "added_share": round(median_ratio(seconds["ours"], seconds["gymnasium"]) - 1, 3),
+    }
+
+
+def env_step(env: gym.Env) -> Callable[[], None]:
+    """
+    :param env: to step with one action over and over, reset where an episode ends
+    """
+    action = env.action_space.sample()
+    env.reset(seed=0)
+
+    def step() -> None:
+        if any(env.step(action)[2:4]):
+            env.reset()
+
+    return step
+
+
+def profile_rollout(n_envs: int, vec_steps: int) -> dict[str, float]:
+    """
+    Where the time of ``learn`` goes on HalfCheetah, with one gradient step per environment step.
+
+    :param n_envs: environments side by side
+    :param vec_steps: steps of all of them
+    :return: environment steps per second, and the shares of gradient steps, of physics (with our wrappers, without SB3's
+        vector environment), and of all else
+    """
+    vec_env = make_vec_env("sb3_gac/HalfCheetah-v5", n_envs, seed=0, env_kwargs={"noise_std": 0.1})
+    small = {**sb3_gac.preset("small"), "learning_starts": 0, "buffer_size": 50_000, "device": "cpu"}
+    model = sb3_gac.GAC("MultiInputPolicy", vec_env, **small)
+    model.learn(4 * n_envs)
+    spent = {"gradient": 0.0}
+    train = model.train
+
+    def timed_train(*args: Any, **kwargs: Any) -> None:
+        start = time.perf_counter()
+        train(*args, **kwargs)
+        spent["gradient"] += time.perf_counter() - start
+
+    model.train = timed_train  # type: ignore[method-assign]
+    start = time.perf_counter()
+    model.learn(vec_steps * n_envs)
+    total = time.perf_counter() - start
+    physics = n_envs * vec_steps * float(np.median([timer(env_step(vec_env.envs[0]))(300) for _ in range(5)]))  # type: ignore
+    shares = {"gradient_share": spent["gradient"] / total, "physics_share": physics / total}
+    rounded = {name: round(share, 3) for name, share in shares.items()}
+    return {
+        "steps_per_second": round(vec_steps * n_envs / total, 1),
+        **rounded,
+        "other_share": round(1 - sum(shares.values()), 3),
     }
 
 
 def measure(threads: list[int], quick: bool) -> dict[str, Any]:
     """
     :param threads: torch's, one table each
-    :param quick: two sizes and few rounds
+    :param quick: one size and few rounds
     :return: tables
     """
     rounds = 3 if quick else ROUNDS
-    results: dict[str, Any] = {"steps": [], "growth": [], "buffers": []}
+    results: dict[str, Any] = {"steps": [], "growth": [], "rollout": [], "wrappers": [compare_wrappers(rounds)], "buffers": []}
     for count in threads:
-        th.set_num_threads(count)
         for task, batch in [("HalfCheetah", 256)] if quick else [(task, batch) for task in SIZES for batch in (256, 512)]:
             row = {"task": task, "threads": count, "batch": batch, "width": 256}
-            results["steps"].append(row | compare_steps(SIZES[task], batch, 256, rounds))
-    for batch, width in [] if quick else [(64, 256), (1024, 256), (4096, 256), (256, 64), (256, 128), (256, 512), (256, 1024)]:
-        row = {"threads": threads[-1], "batch": batch, "width": width}
-        results["growth"].append(row | compare_steps(SIZES["HalfCheetah"], batch, width, rounds=3))
+            results["steps"].append(row | compare_steps(SIZES[task], batch, 256, count, rounds))
+    for batch, width, privileged in [] if quick else GROWTH:
+        row = {"threads": threads[-1], "batch": batch, "width": width, "privileged": privileged}
+        results["growth"].append(row | compare_steps((8, privileged, 6), batch, width, threads[-1], rounds=5))
+    for n_envs in ENVS:
+        vec_steps = max(4, (100 if quick else 1_000) // n_envs)
+        results["rollout"].append({"envs": n_envs, "threads": threads[-1]} | profile_rollout(n_envs, vec_steps))
     for task, sizes in SIZES.items():
         results["buffers"].append({"task": task} | compare_buffers(sizes))
     return results
@@ -204,7 +275,7 @@ def main() -> None:
     flags = f"--threads {' '.join(map(str, options.threads))}{' --quick' if options.quick else ''}"
     record = {"command": f"python -m benchmarks.speed {flags}", **provenance(), **results}
     options.out.with_suffix(".json").write_text(json.dumps(record, indent=1))
-    for name in ("steps", "growth", "buffers"):
+    for name in ("steps", "growth", "rollout", "wrappers", "buffers"):
         print(f"\n{name}\n\n{markdown(results[name])}")
 
 

@@ -86,7 +86,7 @@ def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", **
     if misplacing:
         raise ValueError(f"{misplacing} would change the observation, of which the split is made by position.")
     layout = TASKS[task]
-    env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs})
+    env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs}).unwrapped
     visible = layout.velocity if privileged == "velocity" else tuple(sorted((*layout.partial, *layout.velocity)))
     return SensorNoise(SplitObservation(env, layout.partial, visible), noise_std)
 

@@ -19,6 +19,7 @@ from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxe
 
 KeySelection = Sequence[str] | Mapping[str, Sequence[int] | None]
 Observation = dict[str, np.ndarray]
+_NOISE_BLOCK = 128  # drawn at once: one by one takes several times as long
 _NOISE_STREAM = 0x6E6F697365  # keeps the noise apart from generators that others seed with the same number
 
 
@@ -57,18 +58,20 @@ class SplitObservation(_SplitWrapper):
         space = env.observation_space
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ValueError(f"SplitObservation needs a one-dimensional Box observation, but the environment has {space}.")
-        self._indices = {
+        indices = {
             PARTIAL: _check_indices(PARTIAL, partial, space),
             PRIVILEGED: _check_indices(PRIVILEGED, privileged, space),
         }
-        self.observation_space = spaces.Dict({key: take_from_box(space, index) for key, index in self._indices.items()})
+        self.observation_space = spaces.Dict({key: take_from_box(space, index) for key, index in indices.items()})
+        self._selectors = [_as_slice(index) for index in indices.values()]
 
     def observation(self, observation: np.ndarray) -> Observation:
         """
         :param observation: of the wrapped environment, shape (D,)
         :return: ``partial`` and ``privileged``, float32
         """
-        return {key: observation[index].astype(np.float32) for key, index in self._indices.items()}
+        partial, privileged = self._selectors
+        return {PARTIAL: observation[partial].astype(np.float32), PRIVILEGED: observation[privileged].astype(np.float32)}
 
 
 class SplitDictObservation(_SplitWrapper):
@@ -176,18 +179,24 @@ class SensorNoise(_EntryWrapper):
         self._set_entry_space(spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype))
         self._stream = [_NOISE_STREAM] * (1 + _count_wrappers(env, SensorNoise))  # apart from noise further in
         self._generator = np.random.default_rng()
+        self._drawn = np.empty((0, *self._entry.shape), dtype=dtype)
+        self._n_used = 0
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         if seed is not None:
             self._generator = np.random.default_rng([seed, *self._stream])
+            self._n_used = len(self._drawn)
         return self._noisy(value)
 
     def _next(self, value: np.ndarray, action: Any) -> np.ndarray:
         return self._noisy(value)
 
     def _noisy(self, value: np.ndarray) -> np.ndarray:
-        noise = self._generator.standard_normal(value.shape, dtype=np.float32) * self.noise_std
-        return (value + noise).astype(value.dtype)
+        if self._n_used == len(self._drawn):
+            noise = self._generator.standard_normal((_NOISE_BLOCK, *self._entry.shape), dtype=np.float32) * self.noise_std
+            self._drawn, self._n_used = noise.astype(self._entry.dtype), 0
+        self._n_used += 1
+        return value + self._drawn[self._n_used - 1]
 
 
 class History(_EntryWrapper):
@@ -247,6 +256,12 @@ def _count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
         count += isinstance(env, kind)
         env = env.env
     return count
+
+
+def _as_slice(index: np.ndarray) -> np.ndarray | slice:
+    """The same selection, faster where it is a range."""
+    first, last = int(index[0]), int(index[-1])
+    return slice(first, last + 1) if np.array_equal(index, np.arange(first, last + 1)) else index
 
 
 def _check_indices(name: str, indices: Sequence[int], space: spaces.Box) -> np.ndarray:

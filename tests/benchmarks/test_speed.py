@@ -1,10 +1,13 @@
 """What the speed benchmark counts and compares."""
 
+import multiprocessing
 import time
 
 import pytest
+import torch as th
 
-from benchmarks.speed import alternate, compare_buffers, compare_steps, step_flops
+from benchmarks.contenders import alternate, process_timers, timer
+from benchmarks.speed import compare_buffers, compare_steps, profile_rollout, step_flops
 
 
 def test_arithmetic_of_a_step_by_hand():
@@ -24,14 +27,36 @@ def test_arithmetic_is_linear_in_the_batch():
 
 def test_contenders_alternate():
     calls = []
-    seconds = alternate({"a": lambda: calls.append("a"), "b": lambda: (calls.append("b"), time.sleep(0.001))}, 2, 3)
-    assert calls == ["a"] * 3 + ["b"] * 3 + (["a"] * 3 + ["b"] * 3) * 3
+    timers = {"a": timer(lambda: calls.append("a")), "b": timer(lambda: (calls.append("b"), time.sleep(0.001)))}
+    seconds = alternate(timers, repetitions=2, rounds=3)
+    assert calls == (["a"] * 3 + ["b"] * 3) * 4
     assert [len(values) for values in seconds.values()] == [3, 3]
     assert min(seconds["b"]) >= 0.001
 
 
+def test_contenders_in_processes_of_their_own_have_their_threads_and_end():
+    with process_timers(_sleep, {"short": (0.001,), "long": (0.02,)}, threads=1) as timers:
+        assert 0.001 <= timers["short"](2) < 0.02 <= timers["long"](2)
+        assert len(multiprocessing.active_children()) == 2
+    deadline = time.monotonic() + 20
+    while multiprocessing.active_children() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not multiprocessing.active_children()
+
+
+def _sleep(seconds):
+    assert th.get_num_threads() == 1
+    return lambda: time.sleep(seconds)
+
+
 def test_comparisons_give_finite_figures():
-    row = compare_steps((2, 3, 1), batch=8, width=8, rounds=1)
+    row = compare_steps((2, 3, 1), batch=8, width=8, threads=1, rounds=1)
     assert row["gac_over_sac"] == pytest.approx(row["gac_per_second"] / row["sac_per_second"], rel=0.02)
     assert 0 < row["gac_share_of_limit"] < 1
     assert compare_buffers((169, 270, 17), capacity=6_000)["bytes_over_sb3"] <= 0.52
+
+
+def test_shares_of_the_rollout_add_up():
+    row = profile_rollout(n_envs=2, vec_steps=20)
+    assert row["gradient_share"] + row["physics_share"] + row["other_share"] == pytest.approx(1, abs=0.002)
+    assert 0 < row["physics_share"] < row["gradient_share"] < 1
