@@ -42,7 +42,7 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def build_arguments(spec: RunSpec) -> tuple[type[sb3_gac.GAC], dict[str, Any]]:
+def build_arguments(spec: RunSpec) -> tuple[type[Any], dict[str, Any]]:
     """
     :param spec: of the run
     :return: class, and arguments: preset, then suite, then algorithm
@@ -74,7 +74,8 @@ def run(spec: RunSpec, root: Path) -> Path:
     env_id, env_kwargs = f"sb3_gac/{spec.task}-v5", {"noise_std": spec.noise}
     env = make_vec_env(env_id, spec.envs, seed=spec.seed, env_kwargs=env_kwargs)
     eval_env = make_vec_env(env_id, spec.eval_episodes, env_kwargs=env_kwargs)
-    callback = sb3_gac.GuiderLearnerEvalCallback(
+    has_guider = hasattr(algorithm_class, "predict_guider")
+    callback = (sb3_gac.GuiderLearnerEvalCallback if has_guider else sb3_gac.SeededEvalCallback)(
         eval_env,
         eval_seed=EVAL_SEED,
         eval_freq=spec.eval_every // spec.envs,

@@ -1,4 +1,4 @@
-"""Evaluation of guider and learner side by side."""
+"""Evaluation from the same seeds every time: of the deployed policy, and of guider and learner side by side."""
 
 import warnings
 from pathlib import Path
@@ -13,6 +13,48 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 _WATCHED = ("train/kl", "train/target_kl", "train/kl_coef", "train/kl_coef_on_bound")
 
 
+class SeededEvalCallback(EvalCallback):
+    """
+    ``EvalCallback`` with the same initial states and sensor noise at every evaluation, and its results kept in ``history``.
+
+    :param eval_env: environment for evaluation
+    :param eval_seed: seed of the evaluation environments before every evaluation
+    :param kwargs: of ``EvalCallback``
+    """
+
+    def __init__(self, eval_env: gym.Env | VecEnv, eval_seed: int = 10_000, **kwargs: Any):
+        super().__init__(eval_env, **kwargs)
+        self.eval_seed = eval_seed
+        self.history: list[dict[str, float]] = []
+        self._episode_returns: list[float] = []
+
+    def _on_step(self) -> bool:
+        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+            return True
+        self._before_evaluation()
+        self.eval_env.seed(self.eval_seed)
+        self._episode_returns = []
+        go_on = super()._on_step()
+        returns = np.array(self._episode_returns)
+        self.history.append({"timesteps": self.num_timesteps, "learner": returns.mean()})
+        self._after_evaluation(returns)
+        return go_on
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        super()._log_success_callback(locals_, globals_)
+        self._episode_returns = locals_["episode_rewards"]
+
+    def _before_evaluation(self) -> None:
+        """For what else is to be evaluated."""
+
+    def _after_evaluation(self, returns: np.ndarray) -> None:
+        """
+        For what is to be added to the last row of ``history``.
+
+        :param returns: of the deployed policy's episodes
+        """
+
+
 class _GuiderPredictor:
     """A model's guider, as something that SB3's ``evaluate_policy`` can evaluate."""
 
@@ -20,7 +62,7 @@ class _GuiderPredictor:
         self.predict = model.predict_guider
 
 
-class GuiderLearnerEvalCallback(EvalCallback):
+class GuiderLearnerEvalCallback(SeededEvalCallback):
     """
     Evaluate the learner, as ``EvalCallback`` does, and the guider on the same seeds (the paper's Figure 4).
 
@@ -46,16 +88,14 @@ class GuiderLearnerEvalCallback(EvalCallback):
         log_path: str | None = None,
         **kwargs: Any,
     ):
-        super().__init__(eval_env, log_path=log_path, **kwargs)
-        self.eval_seed = eval_seed
+        super().__init__(eval_env, eval_seed, log_path=log_path, **kwargs)
         self.patience = patience
         self.gap_tolerance = gap_tolerance
-        self.history: list[dict[str, float]] = []
         self._directory = None if log_path is None else Path(log_path)
         self._since_evaluation: dict[str, list[float]] = {}
         self._watched: dict[str, float] = {}
         self._in_a_row = {"kl": 0, "bound": 0, "gap": 0}
-        self._episode_returns: list[float] = []
+        self._guider_returns = np.array([])
 
     def _on_rollout_start(self) -> None:
         """Collect what the last gradient steps logged: the logger forgets it at every dump."""
@@ -64,21 +104,10 @@ class GuiderLearnerEvalCallback(EvalCallback):
             if name in logged:
                 self._since_evaluation.setdefault(name, []).append(logged[name])
 
-    def _on_step(self) -> bool:
-        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
-            return True
+    def _before_evaluation(self) -> None:
         self._watched.update({name: float(np.mean(values)) for name, values in self._since_evaluation.items()})
         self._since_evaluation.clear()
-        guider_returns = self._evaluate_guider()
-        self.eval_env.seed(self.eval_seed)
-        self._episode_returns = []
-        go_on = super()._on_step()
-        self._remember(guider_returns, np.array(self._episode_returns))
-        return go_on
-
-    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
-        super()._log_success_callback(locals_, globals_)
-        self._episode_returns = locals_["episode_rewards"]
+        self._guider_returns = self._evaluate_guider()
 
     def _evaluate_guider(self) -> np.ndarray:
         if self.model.get_vec_normalize_env() is not None:
@@ -95,15 +124,15 @@ class GuiderLearnerEvalCallback(EvalCallback):
         self.logger.record("eval/guider_mean_reward", float(np.mean(returns)))
         return np.array(returns)
 
-    def _remember(self, guider_returns: np.ndarray, learner_returns: np.ndarray) -> None:
-        row = {"timesteps": self.num_timesteps, "learner": learner_returns.mean(), "guider": guider_returns.mean()}
-        self.history.append(row | {name.removeprefix("train/"): value for name, value in self._watched.items()})
+    def _after_evaluation(self, returns: np.ndarray) -> None:
+        guider = {"guider": self._guider_returns.mean()}
+        self.history[-1].update(guider | {name.removeprefix("train/"): value for name, value in self._watched.items()})
         if self._directory is not None:
             np.savez(
                 self._directory / "guider_evaluations.npz",
                 **{name: np.array([entry.get(name, np.nan) for entry in self.history]) for name in self.history[-1]},  # type: ignore[arg-type]
             )
-        self._warn_if_not_following(guider_returns, learner_returns)
+        self._warn_if_not_following(self._guider_returns, returns)
 
     def _warn_if_not_following(self, guider_returns: np.ndarray, learner_returns: np.ndarray) -> None:
         gap = guider_returns.mean() - learner_returns.mean()

@@ -11,7 +11,8 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from typing_extensions import Self
 
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.checks import (
@@ -58,15 +59,36 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     A subclass names its policy class in ``policy_aliases`` and writes one gradient step.
 
-    :param policy: "MultiInputPolicy", or a policy class
+    The arguments up to ``target_entropy``, and from ``stats_window_size`` on, are those of SB3's SAC.
+
+    :param policy: "MultiInputPolicy", or a subclass of the policy class of that name
     :param env: environment with Dict observations and Box actions
-    :param ent_coef: "auto", "auto_<start value>" or a number: entropy temperature
+    :param learning_rate: of policies, critics and the entropy temperature; a number or a schedule
+    :param buffer_size: transitions kept
+    :param learning_starts: steps of uniform warm-up
+    :param batch_size: transitions per gradient step
+    :param tau: Polyak coefficient of the target critics
+    :param gamma: discount factor
+    :param train_freq: steps, or (n, "step" | "episode"), between two rounds of training
+    :param gradient_steps: gradient steps per round; -1 for as many as there were environment steps
+    :param action_noise: added to the behaviour policy's actions
+    :param replay_buffer_class: default :class:`CompactDictReplayBuffer`, which stores each observation once
+    :param replay_buffer_kwargs: keyword arguments for it
+    :param optimize_memory_usage: of other replay buffers, see SB3
+    :param n_steps: rewards summed up in a critic's target before it bootstraps
+    :param ent_coef: entropy temperature: "auto", "auto_<start value>" or a number
+    :param target_update_interval: gradient steps between two updates of the targets
     :param target_entropy: "auto" for -0.5 per action dimension, "sac" for SAC's -1 per dimension, or a number
-    :param target_update_interval: gradient steps between two updates of the target networks
-    :param max_grad_norm: bound on the gradient norm of each network, ``None`` for no bound
-    :param lr_scales: network -> multiple of the learning rate; "critic" stands for all critics
-    :param role_keys: role -> observation entries, where they differ from the default
-    :param kwargs: arguments of SB3's ``OffPolicyAlgorithm``
+    :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
+    :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
+    :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others
+    :param stats_window_size: episodes averaged in rollout statistics
+    :param tensorboard_log: log directory, ``None`` for no log
+    :param policy_kwargs: keyword arguments of the policy class
+    :param verbose: 0 silent, 1 information, 2 debug
+    :param seed: of the pseudo-random generators
+    :param device: "auto", "cpu", "cuda", ...
+    :param _init_setup_model: build the networks at construction
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
@@ -75,17 +97,60 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def __init__(
         self,
-        policy: str | type[BasePolicy],
+        policy: str | type[AsymmetricPolicy],
         env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
         ent_coef: str | float = "auto",
-        target_entropy: str | float = "auto",
         target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
         max_grad_norm: float | None = 1.0,
         lr_scales: Mapping[str, float] | None = None,
         role_keys: RoleKeys | None = None,
-        **kwargs: Any,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
     ):
-        super().__init__(policy, env, support_multi_env=True, sde_support=False, **kwargs)  # type: ignore[arg-type]
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class,
+            replay_buffer_kwargs,
+            optimize_memory_usage,
+            n_steps,
+            policy_kwargs,
+            stats_window_size,
+            tensorboard_log,
+            verbose,
+            device,
+            support_multi_env=True,
+            seed=seed,
+            sde_support=False,
+        )
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
         self.target_update_interval = target_update_interval
@@ -93,6 +158,8 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.lr_scales = lr_scales
         self.role_keys = role_keys
         self._halves_together = False
+        if _init_setup_model:
+            self._setup_model()
 
     # --- set-up -----------------------------------------------------------------------------------------------------
 
@@ -166,7 +233,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
     @property
     def actor(self) -> th.nn.Module:  # type: ignore[override]
         """The deployed policy."""
-        return self.policy.actor
+        return self.policy.deployed
 
     @property
     def critic(self) -> th.nn.Module:
@@ -249,6 +316,19 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         except ValueError:
             self._last_obs = None
             raise
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """See SB3's ``OffPolicyAlgorithm.learn``; TensorBoard's runs are named after the class by default."""
+        tb_log_name = tb_log_name or type(self).__name__
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     # --- training ---------------------------------------------------------------------------------------------------
 

@@ -145,7 +145,7 @@ class AsymmetricPolicy(BasePolicy):
         :param lr_schedule: learning rate schedule
         :param unclipped: how many of the deployed policy's last parameters have no say in the clipping of its gradient
         """
-        deployed = list(self.actor.parameters())  # with a shared encoder, whoever else holds it
+        deployed = list(self.deployed.parameters())  # with a shared encoder, whoever else holds it
         self.flat_parameters = {self.roles.deployed: FlatParameters(trainable(deployed), unclipped)}
         for role in self.roles.others:
             if getattr(self, role) is not None:
@@ -179,8 +179,8 @@ class AsymmetricPolicy(BasePolicy):
             parameters.refresh()
 
     @property
-    def actor(self) -> DeployedPolicy:
-        """SB3's name for the policy that acts at evaluation."""
+    def deployed(self) -> DeployedPolicy:
+        """The policy that acts at evaluation."""
         return getattr(self, self.roles.deployed)
 
     @property
@@ -234,14 +234,14 @@ class AsymmetricPolicy(BasePolicy):
         :param deterministic: mode instead of a sample
         :return: action in the environment's range, and ``state``
         """
-        return self.actor.predict(observation, state, episode_start, deterministic)
+        return self.deployed.predict(observation, state, episode_start, deterministic)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """The deployed policy's action in [-1, 1], shape (B, A)."""
         return self._predict(obs, deterministic)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self.actor._predict(observation, deterministic)
+        return self.deployed._predict(observation, deterministic)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """
@@ -249,7 +249,7 @@ class AsymmetricPolicy(BasePolicy):
         :return: tensors, and whether they were batched
         """
         if not isinstance(observation, Mapping):
-            return self.actor.obs_to_tensor(observation)
+            return self.deployed.obs_to_tensor(observation)
         known = self.observation_space.spaces  # type: ignore[attr-defined]
         return super().obs_to_tensor({key: value for key, value in observation.items() if key in known})
 

@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_gac.common.checks import check_choice, check_not_negative, check_positive
@@ -27,26 +27,8 @@ class GAC(GuidedUpdate):
     Guided Actor-Critic: a guider that sees everything collects the data, a learner that sees ``partial`` alone is
     pulled towards it by a KL constraint and by critics of its own. ``predict`` is the learner.
 
-    The arguments up to ``target_entropy``, and from ``stats_window_size`` on, are those of SB3's SAC.
+    All arguments that are not described here are those of :class:`AsymmetricOffPolicyAlgorithm`, most of them SAC's.
 
-    :param policy: "MultiInputPolicy", or a subclass of :class:`GACPolicy`
-    :param env: environment with Dict observations and Box actions
-    :param learning_rate: of policies, critics and the entropy temperature; a number or a schedule
-    :param buffer_size: transitions kept
-    :param learning_starts: steps of uniform warm-up
-    :param batch_size: transitions per gradient step
-    :param tau: Polyak coefficient of the target critics
-    :param gamma: discount factor
-    :param train_freq: steps, or (n, "step" | "episode"), between two rounds of training
-    :param gradient_steps: gradient steps per round; -1 for as many as there were environment steps
-    :param action_noise: added to the guider's actions
-    :param replay_buffer_class: default :class:`CompactDictReplayBuffer`, which stores each observation once
-    :param replay_buffer_kwargs: keyword arguments for it
-    :param optimize_memory_usage: of other replay buffers, see SB3
-    :param n_steps: rewards summed up in a critic's target before it bootstraps
-    :param ent_coef: entropy temperature beta: "auto", "auto_<start value>" or a number
-    :param target_update_interval: gradient steps between two updates of the targets
-    :param target_entropy: "auto" for -0.5 per action dimension (the paper's), "sac" for -1 per dimension, or a number
     :param target_kl: bound on KL(guider || learner), reduced as ``kl_reduction`` says; a number or a schedule
     :param kl_coef: weight alpha of the KL: "auto" (learned, eq. 17), "auto_<start value>" or a number
     :param kl_coef_bounds: smallest and largest value of a learned ``kl_coef``
@@ -59,16 +41,6 @@ class GAC(GuidedUpdate):
         learner: a pull towards it closes no gap, and the learner chases what moves along with it
     :param learner_entropy: SAC's entropy term in the learner's objective and critics, without which its mean drifts
         into saturation; False for eqs. 15 and 16 as printed
-    :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
-    :param lr_scales: network -> multiple of ``learning_rate``, such as ``{"critic": 3.0}`` or ``{"guider": 0.3}``
-    :param role_keys: role -> observation entries, by default ``partial`` for the learner and all for the others
-    :param stats_window_size: episodes averaged in rollout statistics
-    :param tensorboard_log: log directory, ``None`` for no log
-    :param policy_kwargs: keyword arguments of :class:`GACPolicy`
-    :param verbose: 0 silent, 1 information, 2 debug
-    :param seed: of the pseudo-random generators
-    :param device: "auto", "cpu", "cuda", ...
-    :param _init_setup_model: build the networks at construction
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
@@ -116,31 +88,32 @@ class GAC(GuidedUpdate):
         super().__init__(
             policy,
             env,
-            ent_coef=ent_coef,
-            target_entropy=target_entropy,
-            target_update_interval=target_update_interval,
-            max_grad_norm=max_grad_norm,
-            lr_scales=lr_scales,
-            role_keys=role_keys,
-            learning_rate=learning_rate,
-            buffer_size=buffer_size,
-            learning_starts=learning_starts,
-            batch_size=batch_size,
-            tau=tau,
-            gamma=gamma,
-            train_freq=train_freq,
-            gradient_steps=gradient_steps,
-            action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
-            optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
-            policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            seed=seed,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class,
+            replay_buffer_kwargs,
+            optimize_memory_usage,
+            n_steps,
+            ent_coef,
+            target_update_interval,
+            target_entropy,
+            max_grad_norm,
+            lr_scales,
+            role_keys,
+            stats_window_size,
+            tensorboard_log,
+            policy_kwargs,
+            verbose,
+            seed,
+            device,
+            _init_setup_model=False,
         )
         self.target_kl = target_kl
         self.kl_coef = kl_coef
@@ -205,18 +178,6 @@ class GAC(GuidedUpdate):
         scaled_action, vectorized = self.policy.behaviour_action(observation, deterministic)
         action = self.policy.unscale_action(scaled_action)
         return (action if vectorized else action.squeeze(axis=0)), state
-
-    def learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "GAC",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> "GAC":
-        """See SB3's ``OffPolicyAlgorithm.learn``."""
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _dual_names(self) -> list[str]:
         return [*super()._dual_names(), "kl_coef_dual"]

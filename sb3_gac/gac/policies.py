@@ -97,6 +97,11 @@ class GACPolicy(AsymmetricPolicy):
         self._finish(lr_schedule, unclipped=deployment_head)
 
     @property
+    def actor(self) -> Learner:
+        """SB3's name for the policy that acts at evaluation."""
+        return self.learner
+
+    @property
     def critic(self) -> CriticEnsemble:
         """SB3's name for the critic without the KL term (eq. 15); the guided one in ablations that have no other."""
         return self.guider_critic if self.learner_critic is None else self.learner_critic

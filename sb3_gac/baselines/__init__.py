@@ -1,0 +1,1 @@
+"""The algorithms that GAC is compared with, one small class a file."""

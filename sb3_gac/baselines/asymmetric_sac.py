@@ -1,0 +1,120 @@
+"""Soft Actor-Critic whose critics see more than its actor: SAC-asym, and with other keys SAC on either view."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_gac.common.actors import LOG_STD_BOUNDS, DeployedPolicy
+from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.common.losses import learner_loss, learner_target
+from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm, Batch, Metrics
+from sb3_gac.common.policies import AsymmetricPolicy
+from sb3_gac.common.roles import Roles
+
+
+class SquashedGaussianActor(DeployedPolicy):
+    """SAC's actor: mean and log standard deviation from one network."""
+
+    def forward(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param obs: observation with at least the actor's entries, B of each
+        :return: mean and log standard deviation before tanh, both (B, A)
+        """
+        latent = self.latent(obs)
+        return self.mean(latent), self.bounded_log_std(latent)
+
+    def distribution(self, obs: PyTorchObs) -> TanhGaussian:
+        """
+        :param obs: observation with at least the actor's entries, B of each
+        :return: shapes (B, A)
+        """
+        return TanhGaussian(*self(obs))
+
+
+class AsymmetricSACPolicy(AsymmetricPolicy):
+    """
+    An actor and twin critics, each on the entries of its role, "actor" or "critic".
+
+    :param observation_space: Dict
+    :param action_space: Box
+    :param lr_schedule: learning rate schedule
+    :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}`` or ``{"actor", "critic"}``
+    :param activation_fn: between layers
+    :param log_std_bounds: smallest and largest log standard deviation before tanh
+    :param kwargs: arguments of :class:`AsymmetricPolicy`
+    """
+
+    roles = Roles("actor", ("critic",))
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
+        **kwargs: Any,
+    ):
+        super().__init__(observation_space, action_space, net_arch, activation_fn, **kwargs)
+        self.constructor_options["log_std_bounds"] = log_std_bounds
+        self.actor = SquashedGaussianActor(**self._role_kwargs("actor"), log_std_bounds=log_std_bounds)
+        shared = self.actor.features_extractor if self.share_features_extractor else None
+        self.critic, self.critic_target = self._make_critic_and_target("critic", shared)
+        self._finish(lr_schedule)
+
+    @property
+    def halves_are_independent(self) -> bool:
+        """The actor climbs the critics: one cannot go without the other."""
+        return False
+
+    def behaviour_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
+        """
+        The actor's action, in [-1, 1].
+
+        :param observation: with at least the actor's entries, single or batched
+        :param deterministic: mode instead of a sample
+        :return: shape (B, \\*action shape), and whether the observation was batched
+        """
+        obs, vectorized = self.actor.obs_to_tensor(observation)
+        with th.no_grad():
+            action = self.actor._predict(obs, deterministic)
+        return action.cpu().numpy().reshape(-1, *self.action_space.shape), vectorized  # type: ignore[misc]
+
+
+class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
+    """
+    SAC with an actor on ``partial`` and critics on every entry (Pinto et al. 2018, arXiv 1710.06542, with SAC's losses).
+
+    ``role_keys={"critic": ["partial"]}`` makes it SAC on the partial view, ``role_keys={"actor": ["partial",
+    "privileged"]}`` SAC on the full state. Arguments are those of :class:`AsymmetricOffPolicyAlgorithm`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": AsymmetricSACPolicy}
+    policy: AsymmetricSACPolicy
+
+    def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
+        """SAC's critics are eq. 15's with the entropy term, its actor eq. 16's without a guider."""
+        ent_coef = self.ent_coef_dual.value
+        metrics = self._fit_critics("critic", batch, self._target(batch, ent_coef))
+        actor = self.policy.actor.distribution(batch.observations)
+        action, log_prob = actor.sample_with_log_prob()
+        q = self.policy.critic(batch.observations, action)
+        metrics |= self._descend("actor", learner_loss(0.0, q, 0.0, log_prob, ent_coef))
+        metrics["ent_coef_loss"] = self.ent_coef_dual.update(log_prob.detach() + float(self.target_entropy))
+        if diagnose:
+            metrics["ent_coef"] = self.ent_coef_dual.value
+            metrics["entropy"] = -log_prob.detach().mean()
+            metrics["std"] = actor.log_std.detach().exp().mean()
+        return metrics
+
+    @th.no_grad()
+    def _target(self, batch: Batch, ent_coef: th.Tensor) -> th.Tensor:
+        action, log_prob = self.policy.actor.distribution(batch.next_observations).sample_with_log_prob()
+        next_q = self.policy.critic_target(batch.next_observations, action)
+        return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, ent_coef)
