@@ -1,20 +1,61 @@
 """
 A suite -> its runs, several side by side with one thread each::
 
-    python -m benchmarks.launch benchmarks/suites/foundation.yml --jobs 2
+    python -m benchmarks.launch benchmarks/suites/halfcheetah.yml --jobs 2
 
-Finished runs are skipped, so an interrupted launch is resumed by the same command.  ``--dry-run`` prints the commands.
+Finished runs are skipped and unfinished ones go on from their checkpoints, so an interrupted launch is resumed by the same
+command.  A failed run is tried again.  ``--dry-run`` prints the commands of what is left to do.
 """
 
 import argparse
+import json
 import os
 import shlex
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
 from benchmarks.suite import HERE, RunSpec, read_suite
+
+
+@dataclass
+class Job:
+    """
+    A run that is left to do.
+
+    :param spec: of the run
+    :param directory: of the run
+    :param command: to run it
+    :param state: "waiting", "running", "finished" or "failed"
+    """
+
+    spec: RunSpec
+    directory: Path
+    command: list[str]
+    state: str = "waiting"
+
+    @property
+    def log(self) -> Path:
+        """Where the run's output goes, that of all attempts."""
+        return self.directory / "log.txt"
+
+
+def jobs_left(suite: Path, runs: Path) -> tuple[list[Job], int]:
+    """
+    :param suite: YAML file
+    :param runs: directory of all runs
+    :return: the runs that are not finished, and how many are
+    """
+    specs = read_suite(suite)
+    left = [(index, spec) for index, spec in enumerate(specs) if not (spec.directory(runs) / "evaluations.csv").exists()]
+    jobs = [Job(spec, spec.directory(runs), run_command(suite, index, runs)) for index, spec in left]
+    return jobs, len(specs) - len(left)
 
 
 def run_command(suite: Path, index: int, runs: Path) -> list[str]:
@@ -22,21 +63,66 @@ def run_command(suite: Path, index: int, runs: Path) -> list[str]:
     return [sys.executable, "-m", "benchmarks.run", "--suite", str(suite), "--index", str(index), "--runs", str(runs)]
 
 
-def launch_one(spec: RunSpec, command: list[str], runs: Path) -> bool:
+def launch_one(job: Job, retries: int) -> None:
     """
-    :param spec: of the run
-    :param command: to run it
-    :param runs: directory of all runs
-    :return: whether it ended well; its output is in ``log.txt``
+    :param job: to run in a process of its own with one thread; its state says how it ended
+    :param retries: further attempts after one that failed
     """
-    directory = spec.directory(runs)
-    directory.mkdir(parents=True, exist_ok=True)
-    with (directory / "log.txt").open("w") as log:
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        status = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment, cwd=HERE.parent, check=False)
-    outcome = "finished" if status.returncode == 0 else f"FAILED, see {log.name}"
-    print(f"{directory}: {outcome}", flush=True)
-    return status.returncode == 0
+    job.directory.mkdir(parents=True, exist_ok=True)
+    job.state = "running"
+    for attempt in range(retries + 1):
+        with job.log.open("a") as log:
+            log.write(f"--- attempt {attempt + 1}: {shlex.join(job.command)}\n")
+            log.flush()
+            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+            status = subprocess.run(
+                job.command, stdout=log, stderr=subprocess.STDOUT, env=environment, cwd=HERE.parent, check=False
+            )
+        if status.returncode == 0:
+            job.state = "finished"
+            return
+    job.state = "failed"
+
+
+def progress(job: Job) -> tuple[str, str]:
+    """
+    :param job: in any state
+    :return: steps of its last checkpoint and the learner's return there
+    """
+    try:
+        last = json.loads((job.directory / "checkpoint" / "history.json").read_text())[-1]
+    except (OSError, ValueError, IndexError):
+        return ("", "") if job.state == "waiting" else (f"0 / {job.spec.steps}", "")
+    return f"{last['timesteps']:.0f} / {job.spec.steps}", f"{last['learner']:.1f}"
+
+
+def table(jobs: list[Job]) -> Table:
+    """
+    :param jobs: of this launch; those that wait are counted
+    """
+    waiting = sum(job.state == "waiting" for job in jobs)
+    result = Table("task", "noise", "algorithm", "seed", "state", "steps", "return", caption=f"{waiting} waiting")
+    for job in jobs:
+        if job.state != "waiting":
+            spec, reached = job.spec, ("", "") if job.state == "finished" else progress(job)
+            result.add_row(spec.task, f"{spec.noise:g}", spec.algorithm, str(spec.seed), job.state, *reached)
+    return result
+
+
+def launch(jobs: list[Job], at_once: int, retries: int) -> None:
+    """
+    :param jobs: to run
+    :param at_once: how many side by side
+    :param retries: further attempts after one that failed
+    """
+    console = Console()
+    with ThreadPoolExecutor(at_once) as pool:
+        futures = [pool.submit(launch_one, job, retries) for job in jobs]
+        with Live(
+            get_renderable=lambda: table(jobs), console=console, refresh_per_second=1, transient=not console.is_terminal
+        ):
+            for future in futures:
+                future.result()
 
 
 def main() -> None:
@@ -44,20 +130,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suite", type=Path)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs side by side")
+    parser.add_argument("--retries", type=int, default=1, help="further attempts after a run that failed")
     parser.add_argument("--runs", type=Path, default=HERE / "runs")
     parser.add_argument("--dry-run", action="store_true", help="print the commands of what is left to do")
     options = parser.parse_args()
-    suite, runs = options.suite.resolve(), options.runs.resolve()
-    specs = read_suite(suite)
-    left = [(i, spec) for i, spec in enumerate(specs) if not (spec.directory(runs) / "evaluations.csv").exists()]
-    commands = [run_command(suite, index, runs) for index, _ in left]
+    jobs, finished = jobs_left(options.suite.resolve(), options.runs.resolve())
     if options.dry_run:
-        print("\n".join(shlex.join(command) for command in commands))
+        print("\n".join(shlex.join(job.command) for job in jobs))
         return
-    with ThreadPoolExecutor(options.jobs) as pool:
-        outcomes = list(pool.map(launch_one, [spec for _, spec in left], commands, [runs] * len(left)))
-    print(f"{len(specs) - len(left)} were finished before, {sum(outcomes)} now, {outcomes.count(False)} failed.")
-    sys.exit(outcomes.count(False) > 0)
+    launch(jobs, options.jobs, options.retries)
+    failed = [job for job in jobs if job.state == "failed"]
+    for job in failed:
+        print(f"{job.directory}: FAILED, see {job.log}")
+    print(f"{finished} were finished before, {len(jobs) - len(failed)} now, {len(failed)} failed.")
+    sys.exit(bool(failed))
 
 
 if __name__ == "__main__":

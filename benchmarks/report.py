@@ -1,7 +1,7 @@
 """
 Finished runs of a suite -> a tidy CSV, a summary as JSON and Markdown, and a figure::
 
-    python -m benchmarks.report benchmarks/suites/foundation.yml --out benchmarks/results/foundation
+    python -m benchmarks.report benchmarks/suites/halfcheetah.yml --out benchmarks/results/halfcheetah
 
 A missing run is an error, not a smaller average.
 """

@@ -1,18 +1,21 @@
 """
 One training run -> one directory::
 
-    python -m benchmarks.run --suite benchmarks/suites/foundation.yml --index 0 --runs benchmarks/runs
+    python -m benchmarks.run --suite benchmarks/suites/halfcheetah.yml --index 0 --runs benchmarks/runs
 
-A finished run is skipped.  An unfinished one starts afresh: its directory holds ``evaluations.csv`` only when done.
+A finished run is skipped; an unfinished one goes on from its last checkpoint, which is made after every evaluation.
+The directory holds ``evaluations.csv`` if and only if the run is finished.
 """
 
 import argparse
 import csv
 import dataclasses
+import io
 import json
 import os
 import platform
 import subprocess
+import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -21,9 +24,12 @@ from typing import Any
 import torch as th
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 
 import sb3_gac
-from benchmarks.suite import HERE, RunSpec, read_algorithm, read_suite
+from benchmarks.checkpoint import CheckpointCallback, load_checkpoint, locked, remove_checkpoint, write_atomically
+from benchmarks.config import instantiate, resolve
+from benchmarks.suite import HERE, RunSpec, read_suite
 
 EVAL_SEED = 10_000
 
@@ -42,53 +48,69 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def build_arguments(spec: RunSpec) -> tuple[type[Any], dict[str, Any]]:
-    """
-    :param spec: of the run
-    :return: class, and arguments: preset, then suite, then algorithm
-    """
-    algorithm = read_algorithm(spec.algorithm)
-    algorithm_class = getattr(sb3_gac, algorithm.pop("class"))
-    buffer_size = min(1_000_000, max(spec.steps, 1_000))
-    arguments = {"buffer_size": buffer_size, **spec.overrides, **algorithm, "seed": spec.seed, "device": "cpu"}
-    return algorithm_class, sb3_gac.preset(spec.preset, **arguments)
-
-
-def run(spec: RunSpec, root: Path) -> Path:
+def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     """
     :param spec: of the run
     :param root: directory of all runs
+    :param progress_bar: whether to show one
     :return: the run's directory
+    :raises RuntimeError: if another process is running it
+    :raises ValueError: if its directory holds an unfinished run with another configuration
     """
     directory = spec.directory(root)
     if (directory / "evaluations.csv").exists():
         return directory
     directory.mkdir(parents=True, exist_ok=True)
-    algorithm_class, arguments = build_arguments(spec)
-    resolved = {
-        key: value if isinstance(value, (int, float, str, type(None))) else str(value) for key, value in arguments.items()
-    }
-    configuration = {"run": dataclasses.asdict(spec), "arguments": resolved, **provenance()}
-    (directory / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False))
+    with locked(directory):
+        algorithm_class, arguments = resolve(spec)
+        _write_configuration(directory / "config.yaml", {"run": dataclasses.asdict(spec), "arguments": arguments})
+        history = _train(spec, directory, algorithm_class, instantiate(arguments), progress_bar)
+        write_evaluations(history, directory / "evaluations.csv")
+        remove_checkpoint(directory)
+    return directory
 
+
+def _write_configuration(path: Path, configuration: dict[str, Any]) -> None:
+    """What was written by a process that did not come to the end must have been the same: two runs are never mixed."""
+    if path.exists():
+        before = yaml.safe_load(path.read_text())
+        changed = [key for key in configuration if before.get(key) != configuration[key]]
+        if changed:
+            raise ValueError(f"{path.parent} holds an unfinished run with other settings under {changed}: remove it first.")
+    write_atomically(path, yaml.safe_dump(configuration | provenance(), sort_keys=False))
+
+
+def _train(
+    spec: RunSpec, directory: Path, algorithm_class: Any, arguments: dict[str, Any], progress_bar: bool
+) -> list[dict[str, float]]:
+    """
+    :return: one row per evaluation
+    """
+    started = time.time()
     env_id, env_kwargs = f"sb3_gac/{spec.task}-v5", {"noise_std": spec.noise}
     env = make_vec_env(env_id, spec.envs, seed=spec.seed, env_kwargs=env_kwargs)
     eval_env = make_vec_env(env_id, spec.eval_episodes, env_kwargs=env_kwargs)
-    has_guider = hasattr(algorithm_class, "predict_guider")
-    callback = (sb3_gac.GuiderLearnerEvalCallback if has_guider else sb3_gac.SeededEvalCallback)(
-        eval_env,
-        eval_seed=EVAL_SEED,
-        eval_freq=spec.eval_every // spec.envs,
-        n_eval_episodes=spec.eval_episodes,
-        verbose=0,
+    evaluation = _evaluation_class(algorithm_class)(
+        eval_env, eval_seed=EVAL_SEED, eval_freq=spec.eval_every // spec.envs, n_eval_episodes=spec.eval_episodes, verbose=0
     )
-    started = time.time()
-    model = algorithm_class("MultiInputPolicy", env, **arguments)
-    model.learn(spec.steps, callback=callback)
+    checkpoint = load_checkpoint(algorithm_class, directory, env, spec.seed)
+    if checkpoint is None:
+        model = algorithm_class("MultiInputPolicy", env, **arguments, seed=spec.seed, device="cpu")
+    else:
+        model, evaluation.history = checkpoint
+    model.set_logger(configure(str(directory / "tensorboard"), ["tensorboard"]))
+    callbacks = [evaluation, CheckpointCallback(directory, evaluation)]
+    left = spec.steps - model.num_timesteps
+    model.learn(left, callback=callbacks, reset_num_timesteps=False, progress_bar=progress_bar)
     model.save(directory / "model")
-    (directory / "timing.json").write_text(json.dumps({"seconds": time.time() - started}))
-    write_evaluations(callback.history, directory / "evaluations.csv")
-    return directory
+    seconds = {"seconds": time.time() - started, "steps": left}
+    write_atomically(directory / "timing.json", json.dumps(seconds))
+    return evaluation.history
+
+
+def _evaluation_class(algorithm_class: type) -> type[sb3_gac.SeededEvalCallback]:
+    """An algorithm with a guider has it evaluated beside what is deployed."""
+    return sb3_gac.GuiderLearnerEvalCallback if hasattr(algorithm_class, "predict_guider") else sb3_gac.SeededEvalCallback
 
 
 def write_evaluations(history: list[dict[str, float]], path: Path) -> None:
@@ -98,12 +120,11 @@ def write_evaluations(history: list[dict[str, float]], path: Path) -> None:
     :param history: one row per evaluation
     :param path: CSV file
     """
-    partial_path = path.with_suffix(".tmp")
-    with partial_path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, history[-1].keys(), restval="nan")
-        writer.writeheader()
-        writer.writerows(history)
-    partial_path.replace(path)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, history[-1].keys(), restval="nan")
+    writer.writeheader()
+    writer.writerows(history)
+    write_atomically(path, text.getvalue())
 
 
 def main() -> None:
@@ -113,7 +134,7 @@ def main() -> None:
     parser.add_argument("--index", type=int, required=True, help="which run of the suite, see launch --dry-run")
     parser.add_argument("--runs", type=Path, default=HERE / "runs")
     options = parser.parse_args()
-    print(run(read_suite(options.suite)[options.index], options.runs))
+    print(run(read_suite(options.suite)[options.index], options.runs, progress_bar=sys.stderr.isatty()))
 
 
 if __name__ == "__main__":

@@ -81,7 +81,9 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param target_entropy: "auto" for -0.5 per action dimension, "sac" for SAC's -1 per dimension, or a number
     :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
     :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
-    :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others
+    :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
+        "critic" stands for all critics, which learn far better without sensor noise among their inputs: where
+        ``privileged`` is the whole state, give them ``{"critic": ["privileged"]}``
     :param stats_window_size: episodes averaged in rollout statistics
     :param tensorboard_log: log directory, ``None`` for no log
     :param policy_kwargs: keyword arguments of the policy class

@@ -186,7 +186,7 @@ class AsymmetricPolicy(BasePolicy):
     @property
     def critic_pairs(self) -> dict[str, tuple[CriticEnsemble, CriticEnsemble]]:
         """Role -> (critic, target), for each critic that there is."""
-        critics = [role for role in self.roles.others if role.endswith("critic") and getattr(self, role) is not None]
+        critics = [role for role in self.roles.critics if getattr(self, role) is not None]
         return {role: (getattr(self, role), getattr(self, f"{role}_target")) for role in critics}
 
     def update_targets(self, tau: float) -> None:

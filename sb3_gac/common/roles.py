@@ -1,12 +1,15 @@
 """Which observation entries each role reads: resolved and checked once, when a model is set up."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from gymnasium import spaces
 
 from sb3_gac.common.checks import check_positive
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
+
+CRITICS = "critic"
+T = TypeVar("T")
 
 RoleKeys = Mapping[str, Sequence[str]]
 
@@ -28,9 +31,19 @@ class Roles(NamedTuple):
         return (self.deployed, *self.others)
 
     @property
+    def critics(self) -> list[str]:
+        """Those that value actions."""
+        return [role for role in self.others if role.endswith(CRITICS)]
+
+    @property
     def policies(self) -> list[str]:
-        """All but the critics."""
-        return [role for role in self.all if not role.endswith("critic")]
+        """Those that act."""
+        return [role for role in self.all if role not in self.critics]
+
+    @property
+    def names(self) -> list[str]:
+        """What a user may call them: every role, and "critic" for all critics."""
+        return list(dict.fromkeys([*self.all, CRITICS]))
 
 
 def check_observation_space(observation_space: spaces.Space) -> spaces.Dict:
@@ -57,23 +70,23 @@ def resolve_role_keys(
 
     :param observation_space: of the environment
     :param roles: of the algorithm
-    :param role_keys: role -> entries, for the roles that differ from the default
+    :param role_keys: role, or "critic" for all critics -> entries, where they differ from the default
     :return: role -> entries, for all roles
     :raises ValueError: if a role or an entry is unknown, an entry list is empty, or there is no ``partial`` entry
         for the deployed policy
     """
     entries = tuple(check_observation_space(observation_space).spaces)
     role_keys = role_keys or {}
-    unknown_roles = sorted(set(role_keys) - set(roles.all))
+    unknown_roles = sorted(set(role_keys) - {*roles.all, CRITICS})
     if unknown_roles:
-        raise ValueError(f"role_keys names unknown roles {unknown_roles}; the roles are {list(roles.all)}.")
+        raise ValueError(f"role_keys names unknown roles {unknown_roles}; the roles are {roles.names}.")
     if roles.deployed not in role_keys and PARTIAL not in entries:
         raise ValueError(
             f'The observation has no entry "{PARTIAL}" (its entries are {list(entries)}). Rename the entry that the '
             f'{roles.deployed} may see to "{PARTIAL}", or name it with role_keys={{"{roles.deployed}": ["<entry>"]}}.'
         )
     resolved = dict.fromkeys(roles.all, entries) | {roles.deployed: (PARTIAL,)}
-    for role, keys in role_keys.items():
+    for role, keys in _for_each_role(roles, role_keys).items():
         if isinstance(keys, str) or not keys:
             raise ValueError(f'role_keys["{role}"] must be a non-empty list of observation entries, got {keys!r}.')
         unknown_keys = [key for key in keys if key not in entries]
@@ -125,10 +138,15 @@ def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> di
     :raises ValueError: if a role is unknown or a multiple is not a number above 0
     """
     lr_scales = dict(lr_scales or {})
-    unknown_roles = sorted(set(lr_scales) - {*roles.all, "critic"})
+    unknown_roles = sorted(set(lr_scales) - {*roles.all, CRITICS})
     if unknown_roles:
-        raise ValueError(f'lr_scales names unknown roles {unknown_roles}; the roles are {[*roles.all, "critic"]}.')
+        raise ValueError(f"lr_scales names unknown roles {unknown_roles}; the roles are {roles.names}.")
     for role, scale in lr_scales.items():
         check_positive(f'lr_scales["{role}"]', scale)
-    default = {role: 1.0 if role in roles.policies else lr_scales.get("critic", 1.0) for role in roles.all}
-    return {role: lr_scales.get(role, default[role]) for role in roles.all}
+    return dict.fromkeys(roles.all, 1.0) | _for_each_role(roles, lr_scales)
+
+
+def _for_each_role(roles: Roles, values: Mapping[str, T]) -> dict[str, T]:
+    """What is said of "critic" is said of every critic that is not named itself."""
+    of_critics = {role: values[CRITICS] for role in roles.critics if CRITICS in values}
+    return of_critics | {role: value for role, value in values.items() if role in roles.all}

@@ -12,6 +12,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "learning_starts": 2_000,
         "batch_size": 128,
         "gradient_steps": -1,
+        "role_keys": {"critic": ["privileged"]},
         "policy_kwargs": {"net_arch": [128, 128]},
     },
     # Table 2: use with 128 environments; target_kl per task and noise is in Table 3, this is its middle value

@@ -1,18 +1,27 @@
 """The benchmark programs, run as a user runs them, on a suite of seconds."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pandas as pd
 import pytest
+import torch as th
 import yaml
 
+import benchmarks.run
+from benchmarks.checkpoint import locked
+from benchmarks.config import instantiate, read_algorithm, resolve
 from benchmarks.report import collect, summarise
-from benchmarks.run import build_arguments, run
-from benchmarks.suite import RunSpec, read_algorithm, read_suite
-from sb3_gac import GAC
+from benchmarks.run import run
+from benchmarks.suite import RunSpec, read_preset, read_suite
+from sb3_gac import GAC, preset
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "benchmarks" / "suites" / "smoke.yml"
@@ -37,11 +46,14 @@ def test_each_run_leaves_its_evaluations_configuration_and_model(runs):
         directory = spec.directory(runs)
         evaluations = pd.read_csv(directory / "evaluations.csv")
         assert evaluations.timesteps.tolist() == [200, 400, 600]
-        assert {"learner", "guider", "kl", "target_kl", "kl_coef"} <= set(evaluations.columns)
+        of_guider = {"guider", "kl", "target_kl", "kl_coef"}
+        assert of_guider & set(evaluations.columns) == (of_guider if spec.algorithm.startswith("gac") else set())
         configuration = yaml.safe_load((directory / "config.yaml").read_text())
         assert configuration["run"]["seed"] == spec.seed
         assert configuration["versions"]["torch"]
-        GAC.load(directory / "model")
+        read_algorithm(spec.algorithm)[0].load(directory / "model")
+        assert not list(directory.glob("checkpoint*"))
+        assert list((directory / "tensorboard").glob("events*"))
 
 
 def test_a_finished_run_is_skipped_and_an_unfinished_one_done_again(runs):
@@ -98,10 +110,12 @@ def test_a_failing_run_is_named_with_its_log(tmp_path):
     suite["cells"] = [{"task": "NoSuchTask", "noises": [0.1], "algorithms": ["gac"], "seeds": [0]}]
     path = tmp_path / "broken.yml"
     path.write_text(yaml.safe_dump(suite))
-    result = _program("benchmarks.launch", path, "--runs", tmp_path)
+    result = _program("benchmarks.launch", path, "--runs", tmp_path, "--retries", 1)
     assert result.returncode == 1
-    assert "FAILED, see" in result.stdout
-    assert "NoSuchTask" in (tmp_path / "NoSuchTask-noise0.1" / "gac" / "seed0" / "log.txt").read_text()
+    log = tmp_path / "NoSuchTask-noise0.1" / "gac" / "seed0" / "log.txt"
+    assert f"FAILED, see {log}" in result.stdout.replace("\n", "")
+    assert "NoSuchTask" in log.read_text()
+    assert log.read_text().count("--- attempt") == 2
 
 
 @pytest.mark.parametrize(
@@ -117,17 +131,122 @@ def test_unknown_and_missing_keys_are_refused(tmp_path, change, message):
         read_suite(path)
 
 
-def test_unknown_algorithms_are_refused():
+def test_unknown_algorithms_presets_and_arguments_are_refused():
+    spec = RunSpec("gac", "Ant", 0.1, 7, 1000, 4, "small", 500, 1)
     with pytest.raises(ValueError, match="algorithm must be one of"):
-        read_algorithm("sac")
+        read_algorithm("ppo")
+    with pytest.raises(ValueError, match="preset must be one of"):
+        read_preset("large")
+    with pytest.raises(ValueError, match=r"GAC has no arguments \['taau'\]"):
+        resolve(replace(spec, overrides={"taau": 0.01}))
+    with pytest.raises(ValueError, match="activation_fn must name a class"):
+        instantiate({"policy_kwargs": {"activation_fn": "__import__('os').getcwd()"}})
 
 
 def test_arguments_are_layered():
     """Preset, then suite, then algorithm."""
-    spec = RunSpec("gac-independent", "Ant", 0.1, 7, 1000, 4, "small", 500, 1, {"tau": 0.01, "guider": "residual"})
-    algorithm_class, arguments = build_arguments(spec)
+    overrides = {"tau": 0.01, "guider": "residual", "policy_kwargs": {"activation_fn": "ReLU"}}
+    spec = RunSpec("gac-independent", "Ant", 0.1, 7, 1000, 4, "small", 500, 1, overrides)
+    algorithm_class, arguments = resolve(spec)
     assert algorithm_class is GAC
-    assert (arguments["batch_size"], arguments["tau"], arguments["guider"], arguments["seed"]) == (128, 0.01, "independent", 7)
+    assert (arguments["batch_size"], arguments["tau"], arguments["guider"]) == (128, 0.01, "independent")
+    assert arguments["policy_kwargs"] == {"net_arch": [128, 128], "activation_fn": "ReLU"}
+    assert instantiate(arguments)["policy_kwargs"]["activation_fn"] is th.nn.ReLU
+
+
+@pytest.mark.parametrize(
+    ("task", "noise", "target_kl"),
+    [("Ant", 0.0, 0.01), ("Ant", 0.3, 0.001), ("HalfCheetah", 0.2, 0.001), ("InvertedDoublePendulum", 0.1, 0.001)],
+)
+def test_the_papers_preset_has_the_papers_values(task, noise, target_kl):
+    _, arguments = resolve(RunSpec("gac-independent", task, noise, 0, 2_000_000, 128, "paper-brax", 1, 1))
+    assert arguments["target_kl"] == target_kl
+    assert (arguments["batch_size"], arguments["gradient_steps"], arguments["buffer_size"]) == (512, 64, 1_000_000)
+    _, of_sac = resolve(RunSpec("sac-asym", task, noise, 0, 2_000_000, 128, "paper-brax", 1, 1))
+    assert set(arguments) - set(of_sac) == {"guider", "learner_entropy", "target_kl"}
+
+
+def test_every_algorithm_fits_every_preset():
+    algorithms = yaml.safe_load((ROOT / "benchmarks/hyperparams/algorithms.yml").read_text())
+    presets = [path.stem for path in (ROOT / "benchmarks/hyperparams/presets").glob("*.yml")]
+    assert len(presets) >= 3
+    for preset_name in presets:
+        for algorithm in algorithms:
+            algorithm_class, arguments = resolve(RunSpec(algorithm, "Ant", 0.1, 0, 1000, 4, preset_name, 500, 1))
+            env = gym.make("sb3_gac/InvertedDoublePendulum-v5")
+            algorithm_class("MultiInputPolicy", env, **{**instantiate(arguments), "buffer_size": 1_000, "device": "cpu"})
+
+
+def test_the_librarys_small_preset_is_the_benchmarks():
+    _, arguments = resolve(RunSpec("gac", "Ant", 0.1, 0, 1000, 4, "small", 500, 1))
+    assert {**preset("small"), "buffer_size": 1000} == arguments
+
+
+@pytest.mark.parametrize("program", ["benchmarks.run", "benchmarks.launch"])
+def test_what_is_killed_at_any_moment_is_finished_by_the_same_command(runs, tmp_path, program):
+    """kill -9 after moments that fall before, between and after checkpoints; in the end the same list of finished runs."""
+    specs = read_suite(SMOKE)[:1] if program == "benchmarks.run" else read_suite(SMOKE)
+    arguments = ["--suite", SMOKE, "--index", 0] if program == "benchmarks.run" else [SMOKE, "--jobs", 2]
+    command = [sys.executable, "-m", program, *map(str, arguments), "--runs", str(tmp_path)]
+    moments = np.random.default_rng(0).uniform(4.0, 9.0, size=3)
+    for moment in moments:
+        process = subprocess.Popen(
+            command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        try:
+            process.wait(moment)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        for spec in specs:
+            history = spec.directory(tmp_path) / "checkpoint" / "history.json"
+            if history.exists():
+                json.loads(history.read_text())
+    assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
+    for spec in specs:
+        evaluations = pd.read_csv(spec.directory(tmp_path) / "evaluations.csv")
+        assert evaluations.timesteps.tolist() == [200, 400, 600]
+        read_algorithm(spec.algorithm)[0].load(spec.directory(tmp_path) / "model")
+        assert {path.name for path in spec.directory(tmp_path).iterdir()} - {"log.txt"} == {
+            path.name for path in spec.directory(runs).iterdir()
+        } - {"log.txt"}
+
+
+def test_a_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
+    spec = read_suite(SMOKE)[0]
+    original = benchmarks.run.CheckpointCallback
+
+    class Killed(original):
+        def _on_step(self):
+            super()._on_step()
+            if self.num_timesteps == 500:
+                raise KeyboardInterrupt
+            return True
+
+    monkeypatch.setattr(benchmarks.run, "CheckpointCallback", Killed)
+    with pytest.raises(KeyboardInterrupt):
+        run(spec, tmp_path)
+    monkeypatch.setattr(benchmarks.run, "CheckpointCallback", original)
+    directory = spec.directory(tmp_path)
+    before = json.loads((directory / "checkpoint" / "history.json").read_text())
+    assert [row["timesteps"] for row in before] == [200, 400]
+    run(spec, tmp_path)
+    evaluations = pd.read_csv(directory / "evaluations.csv")
+    assert evaluations.learner[:2].tolist() == [row["learner"] for row in before], "taken over, not made again"
+    assert json.loads((directory / "timing.json").read_text())["steps"] == 200
+    assert GAC.load(directory / "model").num_timesteps == 600
+
+
+def test_two_runs_are_never_mixed(tmp_path):
+    spec = read_suite(SMOKE)[0]
+    directory = spec.directory(tmp_path)
+    directory.mkdir(parents=True)
+    with locked(directory), pytest.raises(RuntimeError, match="Another process is running"):
+        run(spec, tmp_path)
+    configuration = {"run": asdict(spec), "arguments": {**resolve(spec)[1], "tau": 0.5}}
+    (directory / "config.yaml").write_text(yaml.safe_dump(configuration))
+    with pytest.raises(ValueError, match=r"unfinished run with other settings under \['arguments'\]"):
+        run(spec, tmp_path)
 
 
 def test_run_leaves_a_finished_directory_alone(tmp_path):
