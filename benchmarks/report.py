@@ -1,146 +1,200 @@
 """
-Finished runs of a suite -> a tidy CSV, a summary as JSON and Markdown, and a figure::
+Aggregated results -> a figure in the paper's layout, a page with curves to hover over, and tables in Markdown::
 
-    python -m benchmarks.report benchmarks/suites/halfcheetah.yml --out benchmarks/results/halfcheetah
+    python -m benchmarks.report benchmarks/results/halfcheetah
 
-A missing run is an error, not a smaller average.
+reads ``halfcheetah.csv`` and ``halfcheetah.json`` and writes ``.png`` and ``.html`` beside them.
 """
 
 import argparse
+import html
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 import pandas as pd
-import yaml
-
-from benchmarks.suite import HERE, read_suite
+from plotly import graph_objects
+from plotly.subplots import make_subplots
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-CELL = ["task", "noise", "algorithm"]
+COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#7f7f7f")
+STYLE = """
+body {font: 15px sans-serif; margin: 2em}
+table {border-collapse: collapse; margin: 1em 0}
+td, th {border: 1px solid #ccc; padding: 4px 8px}
+"""
 
 
-def collect(suite: Path, runs: Path) -> pd.DataFrame:
+def curves(group: pd.DataFrame, column: str = "learner") -> pd.DataFrame:
     """
-    :param suite: YAML file
-    :param runs: directory of all runs
-    :return: one row per evaluation: task, noise, algorithm, seed, timesteps, learner, guider, kl, ...
-    :raises FileNotFoundError: naming the runs that are not finished
+    :param group: one algorithm in one cell
+    :param column: what to average
+    :return: indexed by environment steps: mean over seeds, and mean -+ 1.96 standard errors
     """
-    specs = read_suite(suite)
-    paths = [spec.directory(runs) / "evaluations.csv" for spec in specs]
-    missing = [str(path.parent) for path in paths if not path.exists()]
-    if missing:
-        raise FileNotFoundError(f"{len(missing)} runs are not finished: {missing}")
-    frames = []
-    for spec, path in zip(specs, paths, strict=True):
-        columns = {"task": spec.task, "noise": spec.noise, "algorithm": spec.algorithm, "seed": spec.seed}
-        frames.append(pd.read_csv(path).assign(**columns))
-    tidy = pd.concat(frames, ignore_index=True)
-    return tidy[[*CELL, "seed", *(column for column in tidy.columns if column not in (*CELL, "seed"))]]
+    by_step = group.groupby("timesteps")[column]
+    error = 1.96 * by_step.std(ddof=1).fillna(0.0) / np.sqrt(by_step.count())
+    return pd.DataFrame({"mean": by_step.mean(), "low": by_step.mean() - error, "high": by_step.mean() + error})
 
 
-def summarise(tidy: pd.DataFrame) -> list[dict[str, Any]]:
-    """
-    :param tidy: see :func:`collect`
-    :return: per task, noise and algorithm: final returns per seed and their mean, and how far KL strayed from its target
-    """
-    rows = []
-    for key, cell in tidy.groupby(CELL, sort=False):
-        final = cell[cell.timesteps == cell.timesteps.max()].sort_values("seed")
-        steady = cell[cell.timesteps >= 5_000]
-        rows.append(
-            {
-                **dict(zip(CELL, key, strict=True)),
-                "learner": final.learner.round(1).tolist(),
-                "learner_mean": round(float(final.learner.mean()), 1),
-                "guider_mean": round(float(final.guider.mean()), 1),
-                "learner_mean_over_training": round(float(cell.learner.mean()), 1),
-                "kl_over_target_min": round(float((steady.kl / steady.target_kl).min()), 3),
-                "kl_over_target_mean": round(float((steady.kl / steady.target_kl).mean()), 3),
-                "kl_over_target_max": round(float((steady.kl / steady.target_kl).max()), 3),
-            }
-        )
-    return rows
+def grid(tidy: pd.DataFrame) -> tuple[list[str], list[float], list[str]]:
+    """Tasks, noises and algorithms, in the order of the runs."""
+    return list(tidy.task.unique()), sorted(tidy.noise.unique()), list(tidy.algorithm.unique())
 
 
 def draw(tidy: pd.DataFrame, path: Path) -> None:
     """
-    Returns above, KL over its target below, one column per task and noise; thin lines are seeds, dashes the guider.
+    Tasks across, noises down; mean and interval of the learner, dashes the guider.
 
-    :param tidy: see :func:`collect`
+    :param tidy: as aggregated
     :param path: of the picture
     """
-    cells = list(tidy.groupby(["task", "noise"], sort=False))
-    figure, axes = plt.subplots(2, len(cells), figsize=(4.5 * len(cells), 6), layout="constrained", squeeze=False)
-    for (returns, kl), ((task, noise), cell) in zip(axes.T, cells, strict=True):
-        for color, (algorithm, group) in zip(
-            matplotlib.color_sequences["tab10"], cell.groupby("algorithm", sort=False), strict=False
-        ):
-            mean = group.groupby("timesteps").mean(numeric_only=True)
-            returns.plot(mean.index, mean.learner, color=color, label=f"{algorithm}, learner", linewidth=2)
-            returns.plot(mean.index, mean.guider, color=color, label=f"{algorithm}, guider", linestyle="--")
-            for _, run in group.groupby("seed"):
-                returns.plot(run.timesteps, run.learner, color=color, linewidth=0.6, alpha=0.6)
-                kl.plot(run.timesteps, run.kl / run.target_kl, color=color, linewidth=0.8)
-        kl.axhline(1.0, color="black", linestyle=":")
-        returns.set(title=f"{task}, noise {noise:g}", ylabel="return")
-        kl.set(xlabel="environment steps", ylabel="KL / target", yscale="log", ylim=(0.3, 30))
+    tasks, noises, algorithms = grid(tidy)
+    size = (4.2 * len(tasks), 3.0 * len(noises))
+    figure, axes = plt.subplots(len(noises), len(tasks), figsize=size, layout="constrained", squeeze=False)
+    for row, noise in enumerate(noises):
+        for column, task in enumerate(tasks):
+            axis = axes[row][column]
+            cell = tidy[(tidy.task == task) & (tidy.noise == noise)]
+            for color, algorithm in zip(COLORS, algorithms, strict=False):
+                group = cell[cell.algorithm == algorithm]
+                if group.empty:
+                    continue
+                learner = curves(group)
+                axis.plot(learner.index, learner["mean"], color=color, label=algorithm, linewidth=1.8)
+                axis.fill_between(learner.index, learner.low, learner.high, color=color, alpha=0.15, linewidth=0)
+                if "guider" in group and group.guider.notna().any():
+                    guider = curves(group, "guider")
+                    axis.plot(guider.index, guider["mean"], color=color, linestyle="--", linewidth=1)
+            axis.set(title=f"{task}, noise {noise:g}", xlabel="environment steps", ylabel="return")
     axes[0][0].legend(fontsize="small")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
-def markdown_table(summary: list[dict[str, Any]]) -> str:
+def interactive(tidy: pd.DataFrame) -> graph_objects.Figure:
     """
-    :param summary: see :func:`summarise`
+    :param tidy: as aggregated
+    :return: the same grid; a click on a name switches an algorithm off in all cells
     """
-    lines = [
-        "| task | noise | algorithm | learner, each seed | mean | guider, mean | KL / target from 5k steps: min, mean, max |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for row in summary:
-        seeds = ", ".join(f"{value:.0f}" for value in row["learner"])
-        kl = ", ".join(f"{row[f'kl_over_target_{name}']:.2f}" for name in ("min", "mean", "max"))
-        lines.append(
-            f"| {row['task']} | {row['noise']:g} | {row['algorithm']} | {seeds} | {row['learner_mean']:.0f} "
-            f"| {row['guider_mean']:.0f} | {kl} |"
+    tasks, noises, algorithms = grid(tidy)
+    titles = [f"{task}, noise {noise:g}" for noise in noises for task in tasks]
+    figure = make_subplots(rows=len(noises), cols=len(tasks), subplot_titles=titles)
+    named = set()
+    for row, noise in enumerate(noises, start=1):
+        for column, task in enumerate(tasks, start=1):
+            cell = tidy[(tidy.task == task) & (tidy.noise == noise)]
+            for color, algorithm in zip(COLORS, algorithms, strict=False):
+                group = cell[cell.algorithm == algorithm]
+                common = {"legendgroup": algorithm, "line": {"color": color}}
+                for seed, run in group.groupby("seed"):
+                    thin = {"color": color, "width": 0.7}
+                    label = f"{algorithm}, seed {seed}"
+                    line = graph_objects.Scatter(
+                        x=run.timesteps,
+                        y=run.learner,
+                        name=label,
+                        legendgroup=algorithm,
+                        line=thin,
+                        showlegend=False,
+                        opacity=0.5,
+                    )
+                    figure.add_trace(line, row, column)
+                if not group.empty:
+                    mean = curves(group)["mean"]
+                    first = algorithm not in named
+                    figure.add_trace(
+                        graph_objects.Scatter(x=mean.index, y=mean, name=algorithm, showlegend=first, **common), row, column
+                    )
+                    named.add(algorithm)
+    figure.update_layout(height=340 * len(noises) + 80, hovermode="closest", template="plotly_white")
+    return figure
+
+
+def cells_table(cells: list[dict[str, Any]]) -> str:
+    """
+    :param cells: as aggregated
+    :return: Markdown
+    """
+    head = ("task", "noise", "algorithm", "learner, each seed", "mean", "IQM [95%]", "guider", "KL / target: min, mean, max")
+    rows = []
+    for cell in cells:
+        iqm, low, high = cell["final_iqm"]
+        kl = (
+            ", ".join(f"{cell[f'kl_over_target_{name}']:.2f}" for name in ("min", "mean", "max"))
+            if "guider_mean" in cell
+            else ""
         )
-    return "\n".join(lines)
+        guider = f"{cell['guider_mean']:.0f}" if "guider_mean" in cell else ""
+        seeds = ", ".join(f"{value:.0f}" for value in cell["final"])
+        first = (cell["task"], f"{cell['noise']:g}", cell["algorithm"], seeds, f"{cell['final_mean']:.0f}")
+        rows.append((*first, f"{iqm:.0f} [{low:.0f}, {high:.0f}]", guider, kl))
+    return markdown(head, rows)
 
 
-def origins(suite: Path, runs: Path) -> dict[str, Any]:
-    """Commits and versions of the runs, and the command."""
-    configurations = [yaml.safe_load((spec.directory(runs) / "config.yaml").read_text()) for spec in read_suite(suite)]
-    seconds = [json.loads((spec.directory(runs) / "timing.json").read_text())["seconds"] for spec in read_suite(suite)]
-    return {
-        "command": f"python -m benchmarks.launch benchmarks/suites/{suite.name}",
-        "commits": sorted({configuration["commit"] for configuration in configurations}),
-        "versions": configurations[0]["versions"],
-        "cpus": configurations[0]["cpus"],
-        "seconds_per_run": {"median": float(np.median(seconds)), "max": max(seconds)},
-    }
+def overall_table(results: dict[str, Any]) -> str:
+    """
+    :param results: as aggregated
+    :return: Markdown
+    """
+    sections = (("normalised_iqm", "normalised IQM"), ("probability_of_improvement", "probability of improvement"))
+    rows = [
+        (label, name, f"{value:.2f} [{low:.2f}, {high:.2f}]")
+        for key, label in sections
+        for name, (value, low, high) in results[key].items()
+    ]
+    return markdown(("over all cells", "algorithm", "estimate [95%]"), rows)
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """
+    :param head: column names
+    :param rows: as many texts each
+    """
+    lines = [tuple(head), tuple("---" for _ in head), *map(tuple, rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def page(tidy: pd.DataFrame, results: dict[str, Any], title: str) -> str:
+    """
+    :param tidy: as aggregated
+    :param results: as aggregated
+    :param title: of the page
+    :return: HTML that needs nothing else
+    """
+    tables = "".join(_html_table(table) for table in (cells_table(results["cells"]), overall_table(results)))
+    plot = interactive(tidy).to_html(full_html=False, include_plotlyjs=True)
+    origin = {key: results[key] for key in ("command", "commits", "versions", "hours", "arguments")}
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}</style>'
+        f"</head><body><h1>{html.escape(title)}</h1>{plot}{tables}<h2>Configuration and versions</h2>"
+        f"<pre>{html.escape(json.dumps(origin, indent=1))}</pre></body></html>"
+    )
+
+
+def _html_table(table: str) -> str:
+    head, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines())
+    tagged = [
+        "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells)
+        for tag, cells in [("th", head), *(("td", row) for row in rows)]
+    ]
+    return "<table>" + "".join(f"<tr>{row}</tr>" for row in tagged) + "</table>"
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("suite", type=Path)
-    parser.add_argument("--runs", type=Path, default=HERE / "runs")
-    parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
+    parser.add_argument("results", type=Path, help="path of the results, without a suffix")
     options = parser.parse_args()
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    tidy = collect(options.suite, options.runs)
-    summary = summarise(tidy)
-    tidy.round(5).to_csv(options.out.with_suffix(".csv"), index=False)
-    results = {**origins(options.suite, options.runs), "summary": summary}
-    options.out.with_suffix(".json").write_text(json.dumps(results, indent=1))
-    draw(tidy, options.out.with_suffix(".png"))
-    print(markdown_table(summary))
+    tidy = pd.read_csv(options.results.with_suffix(".csv"))
+    results = json.loads(options.results.with_suffix(".json").read_text())
+    draw(tidy, options.results.with_suffix(".png"))
+    options.results.with_suffix(".html").write_text(page(tidy, results, options.results.stem))
+    print(f"{cells_table(results['cells'])}\n\n{overall_table(results)}")
 
 
 if __name__ == "__main__":

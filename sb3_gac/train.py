@@ -139,6 +139,8 @@ def train(options: argparse.Namespace) -> Path:
     env = make_vec_env(env_id, n_envs=options.envs, seed=options.seed, env_kwargs=env_kwargs)
     eval_env = make_vec_env(env_id, n_envs=min(5, options.episodes), env_kwargs=env_kwargs)
     gac_arguments = preset(options.preset, buffer_size=min(1_000_000, max(options.steps, 1_000)))
+    if options.privileged != "state":
+        gac_arguments["role_keys"] = None  # without the whole state in one entry, critics need all entries
     configuration = resolved_configuration(options, gac_arguments)
     (directory / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False))
 

@@ -21,6 +21,8 @@ FORBIDDEN = {
         for name in BASELINES
         for pattern in ("{}.py", "{}/**/*.py")
     },
+    "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
+    "benchmarks/report.py": r"torch\b|sb3_gac\b|benchmarks\b",
     "benchmarks/**/*.py": r"sb3_gac\.(.*\.)?_(?!_)",
 }
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,9 +17,9 @@ import torch as th
 import yaml
 
 import benchmarks.run
+from benchmarks.aggregate import collect, compare, summarise_cells
 from benchmarks.checkpoint import locked
 from benchmarks.config import instantiate, read_algorithm, resolve
-from benchmarks.report import collect, summarise
 from benchmarks.run import run
 from benchmarks.suite import RunSpec, read_preset, read_suite
 from sb3_gac import GAC, preset
@@ -69,15 +70,24 @@ def test_a_finished_run_is_skipped_and_an_unfinished_one_done_again(runs):
     assert second.read_text() == wanted, "the same seed gives the same run"
 
 
-def test_report_writes_table_figure_and_origin(runs, tmp_path):
-    result = _program("benchmarks.report", SMOKE, "--runs", runs, "--out", tmp_path / "smoke")
+def test_results_are_aggregated_and_reported(runs, tmp_path):
+    out = tmp_path / "smoke"
+    result = _program("benchmarks.aggregate", SMOKE, "--runs", runs, "--out", out)
     assert result.returncode == 0, result.stderr
-    assert "| InvertedDoublePendulum | 0.1 | gac |" in result.stdout
     record = json.loads((tmp_path / "smoke.json").read_text())
     assert record["command"] == "python -m benchmarks.launch benchmarks/suites/smoke.yml"
-    assert len(record["summary"]) == 2
-    assert (tmp_path / "smoke.png").stat().st_size > 10_000
+    assert [(cell["algorithm"], cell["seeds"]) for cell in record["cells"]] == [("gac", [0, 1]), ("sac-asym", [0, 1])]
+    assert "guider_mean" in record["cells"][0]
+    assert "guider_mean" not in record["cells"][1]
     assert len(pd.read_csv(tmp_path / "smoke.csv")) == 12
+    result = _program("benchmarks.report", out)
+    assert result.returncode == 0, result.stderr
+    assert "| InvertedDoublePendulum | 0.1 | sac-asym |" in result.stdout
+    assert (tmp_path / "smoke.png").stat().st_size > 10_000
+    page = (tmp_path / "smoke.html").read_text()
+    assert "<title>smoke</title>" in page
+    assert "sac-asym, seed 1" in page
+    assert not re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="http', page), "nothing is loaded from elsewhere"
 
 
 def test_a_missing_run_is_an_error(runs, tmp_path):
@@ -85,24 +95,49 @@ def test_a_missing_run_is_an_error(runs, tmp_path):
         collect(SMOKE, tmp_path)
 
 
+def _evaluations(algorithm, seed, learner, task="T", guider=None):
+    rows = pd.DataFrame({"timesteps": [4_000, 8_000], "learner": learner, "task": task, "noise": 0.1, "algorithm": algorithm})
+    if guider is not None:
+        rows = rows.assign(guider=guider, kl=[0.5, 0.008 + 0.003 * seed], target_kl=0.01)
+    return rows.assign(seed=seed)
+
+
 def test_summary_by_hand():
-    rows = [
-        {
-            "task": "T",
-            "noise": 0.1,
-            "algorithm": "gac",
-            "seed": seed,
-            "timesteps": steps,
-            "learner": value,
-            "guider": value + 1,
-        }
-        | {"kl": kl, "target_kl": 0.01}
-        for seed, steps, value, kl in [(1, 4000, 0, 0.5), (1, 8000, 30, 0.011), (0, 4000, 4, 0.5), (0, 8000, 10, 0.008)]
-    ]
-    (summary,) = summarise(pd.DataFrame(rows))
-    assert summary["learner"] == [10, 30]
-    assert (summary["learner_mean"], summary["guider_mean"], summary["learner_mean_over_training"]) == (20, 21, 11)
-    assert (summary["kl_over_target_min"], summary["kl_over_target_max"]) == (0.8, 1.1)
+    tidy = pd.concat(
+        [
+            _evaluations("gac", 1, [0, 30], guider=[1, 31]),
+            _evaluations("gac", 0, [4, 10], guider=[5, 11]),
+            _evaluations("sac-asym", 0, [0, 2]),
+            _evaluations("sac-asym", 1, [0, 2]),
+        ]
+    )
+    ours, theirs = summarise_cells(tidy, reference="sac-asym")
+    assert (ours["seeds"], ours["final"], ours["final_mean"]) == ([0, 1], [10, 30], 20)
+    assert ours["final_iqm"] == [20, 10, 30]
+    assert ours["area_iqm"][0] == 11
+    assert (ours["steps_to_reference"], theirs["steps_to_reference"]) == (4_000, 8_000)
+    assert ours["guider_mean"] == 21
+    assert (ours["kl_over_target_min"], ours["kl_over_target_max"]) == (0.8, 1.1)
+    assert theirs["final_iqm"] == [2, 2, 2]
+
+
+def test_comparison_by_hand():
+    """One algorithm is twice as good in the first task and worse in one of two runs of the second."""
+    runs_of = {("gac", "T"): [20, 20], ("sac", "T"): [10, 10], ("gac", "U"): [30, 50], ("sac", "U"): [40, 40]}
+    tidy = pd.concat(
+        [
+            _evaluations(algorithm, seed, [0, final], task)
+            for (algorithm, task), finals in runs_of.items()
+            for seed, final in enumerate(finals)
+        ]
+    )
+    results = compare(tidy)
+    # Normalised by 20 and 40: gac 1, 1, 0.75, 1.25; sac 0.5, 0.5, 1, 1; the middle half of each
+    assert results["normalised_iqm"]["gac"][0] == 1.0
+    assert results["normalised_iqm"]["sac"][0] == 0.75
+    assert results["probability_of_improvement"]["gac over sac"][0] == pytest.approx((1 + 0.5) / 2)
+    point, low, high = results["probability_of_improvement"]["sac over gac"]
+    assert low <= point <= high
 
 
 def test_a_failing_run_is_named_with_its_log(tmp_path):
