@@ -12,9 +12,10 @@ from torch import nn
 from sb3_gac.common.actors import LOG_STD_BOUNDS, DeployedPolicy
 from sb3_gac.common.distributions import TanhGaussian
 from sb3_gac.common.losses import learner_loss, learner_target
-from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm, Batch, Metrics
+from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.common.policies import AsymmetricPolicy
 from sb3_gac.common.roles import Roles
+from sb3_gac.common.training import Batch, Metrics
 
 
 class SquashedGaussianActor(DeployedPolicy):

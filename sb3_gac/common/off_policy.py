@@ -1,17 +1,15 @@
-"""What off-policy algorithms with a privileged view share: acting, the train loop, logging, checks and save lists."""
+"""What off-policy algorithms with a privileged view share: arguments, their checks, acting and save lists."""
 
-from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from typing_extensions import Self
 
 from sb3_gac.common.buffers import CompactDictReplayBuffer
@@ -22,38 +20,16 @@ from sb3_gac.common.checks import (
     check_terminal_observations,
 )
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
-from sb3_gac.common.losses import critic_loss
-from sb3_gac.common.parallel import halved_threads, has_side_effects, run_halves
+from sb3_gac.common.parallel import has_side_effects
 from sb3_gac.common.policies import AsymmetricPolicy
 from sb3_gac.common.roles import RoleKeys, resolve_lr_scales, resolve_role_keys
+from sb3_gac.common.training import NetworkTraining
 
 ENT_COEF_START = 0.1
 ENT_COEF_BOUNDS = (1e-8, 1e4)
 
-Metrics = dict[str, th.Tensor]
 
-
-class Batch(NamedTuple):
-    """
-    A batch of transitions.
-
-    :param observations: dict of entries, B of each
-    :param actions: in [-1, 1], shape (B, A)
-    :param rewards: shape (B,)
-    :param next_observations: dict of entries, B of each
-    :param dones: 1 where the episode terminated, 0 where it went on or ran into its time limit, shape (B,)
-    :param discounts: gamma to the number of steps that the reward sums up, scalar or shape (B,)
-    """
-
-    observations: PyTorchObs
-    actions: th.Tensor
-    rewards: th.Tensor
-    next_observations: PyTorchObs
-    dones: th.Tensor
-    discounts: th.Tensor | float
-
-
-class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
+class AsymmetricOffPolicyAlgorithm(NetworkTraining):
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
 
@@ -159,7 +135,6 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.max_grad_norm = max_grad_norm
         self.lr_scales = lr_scales
         self.role_keys = role_keys
-        self._halves_together = False
         if _init_setup_model:
             self._setup_model()
 
@@ -262,6 +237,11 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         """Optimiser of a learned entropy temperature."""
         return self.ent_coef_dual.optimizer
 
+    def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
+        """Optimisers that follow ``learning_rate``."""
+        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.flat_parameters]
+        return optimizers if self.ent_coef_optimizer is None else [*optimizers, self.ent_coef_optimizer]
+
     # --- acting -----------------------------------------------------------------------------------------------------
 
     def _sample_action(
@@ -331,111 +311,6 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyAlgorithm):
         """See SB3's ``OffPolicyAlgorithm.learn``; TensorBoard's runs are named after the class by default."""
         tb_log_name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-
-    # --- training ---------------------------------------------------------------------------------------------------
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """
-        :param gradient_steps: number of gradient steps
-        :param batch_size: transitions per step, B
-        """
-        self.policy.set_training_mode(True)
-        self.policy.refresh_parameters()
-        self._update_learning_rate(self._scheduled_optimizers())
-        self._halves_together = self._halves_are_independent and th.get_num_threads() > 1
-        with halved_threads(self._halves_together):
-            history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
-        self._record_metrics(history)
-
-    def _one_update(self, batch_size: int, diagnose: bool) -> Metrics:
-        metrics = self._gradient_step(self._sample_batch(batch_size), diagnose)
-        self._n_updates += 1
-        if self._n_updates % self.target_update_interval == 0:
-            self.policy.update_targets(self.tau)
-        return metrics
-
-    def _run_halves(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
-        """
-        :param tasks: independent of each other, see :func:`run_halves`
-        :return: their results
-        """
-        return run_halves(tasks, self._halves_together)
-
-    def _fit_critics(self, name: str, batch: Batch, target: th.Tensor) -> Metrics:
-        """
-        One step of an ensemble towards its Bellman targets.
-
-        :param name: attribute of the policy
-        :param batch: B transitions
-        :param target: shape (B,)
-        :return: loss, mean Q and gradient norm, named after the ensemble
-        """
-        q = getattr(self.policy, name)(batch.observations, batch.actions)
-        return {f"{name}_q": q.detach().mean()} | self._descend(name, critic_loss(q, target))
-
-    def _descend(self, name: str, loss: th.Tensor, unclipped_loss: th.Tensor | float = 0.0) -> Metrics:
-        """
-        One step of a network's optimiser; whatever else the loss went through stays as it is.
-
-        :param name: attribute of the policy
-        :param loss: scalar
-        :param unclipped_loss: of parameters that have no say in the clipping
-        :return: loss and gradient norm, named after the network
-        """
-        parameters = self.policy.flat_parameters[name]
-        parameters.backward(loss + unclipped_loss)
-        grad_norm = parameters.clip_gradient(self.max_grad_norm)
-        getattr(self.policy, name).optimizer.step()
-        return {f"{name}_loss": loss.detach(), f"{name}_grad_norm": grad_norm}
-
-    @abstractmethod
-    def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
-        """
-        One update of all networks but the targets.
-
-        :param batch: B transitions
-        :param diagnose: whether to add what costs extra, as on the last of a round
-        :return: detached tensors of shape () to log under "train/", left on the device
-        """
-
-    def _sample_batch(self, batch_size: int) -> Batch:
-        assert self.replay_buffer is not None
-        samples = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-        return Batch(
-            samples.observations,
-            samples.actions,
-            samples.rewards.flatten(),
-            samples.next_observations,
-            samples.dones.flatten(),
-            self.gamma if samples.discounts is None else samples.discounts.flatten(),
-        )
-
-    def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
-        """Optimisers that follow ``learning_rate``."""
-        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.flat_parameters]
-        return optimizers if self.ent_coef_optimizer is None else [*optimizers, self.ent_coef_optimizer]
-
-    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        """Follow the schedule; a parameter group's "lr_scale" multiplies it."""
-        super()._update_learning_rate(optimizers)
-        for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
-            for group in optimizer.param_groups:
-                group["lr"] *= group.get("lr_scale", 1.0)
-
-    def _record_metrics(self, history: list[Metrics]) -> None:
-        """Log means over the gradient steps of one ``train()``, and diagnostics of the last: the only host transfer."""
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if not history:
-            return
-        names, last = list(history[0]), history[-1]
-        means = th.stack([th.stack([step[name] for name in names]) for step in history]).mean(dim=0)
-        diagnostics = [name for name in last if name not in names]
-        means = th.cat([means, *(last[name].reshape(1) for name in diagnostics)])
-        values = dict(zip([*names, *diagnostics], means.tolist(), strict=True))
-        values["actor_loss"] = values[f"{self.policy.roles.deployed}_loss"]  # SB3's names for the two
-        values["critic_loss"] = sum(value for name, value in values.items() if name.endswith("critic_loss"))
-        for name, value in values.items():
-            self.logger.record(f"train/{name}", value)
 
     # --- save and load ----------------------------------------------------------------------------------------------
 

@@ -9,7 +9,8 @@ from stable_baselines3.common.utils import FloatSchedule
 from sb3_gac.common.distributions import TanhGaussian, kl_shared_std
 from sb3_gac.common.dual import Coefficient
 from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target, log_std_loss
-from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm, Batch, Metrics
+from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.common.training import Batch, Metrics
 from sb3_gac.gac.policies import ActionDistributions, ActorOutputs, GACPolicy
 
 

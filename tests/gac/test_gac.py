@@ -11,7 +11,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_gac import GAC, GACShare, GACWithoutQ, preset
 from sb3_gac.common.distributions import TanhGaussian
-from sb3_gac.common.off_policy import Batch
+from sb3_gac.common.training import Batch
 from sb3_gac.gac.policies import ActionDistributions
 from sb3_gac.gac.update import StepInputs
 from tests.helpers import TwoViewBandit, small_model

@@ -1,0 +1,152 @@
+"""The train loop, and what a gradient step is put together from."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_gac.common.losses import critic_loss
+from sb3_gac.common.parallel import halved_threads, run_halves
+from sb3_gac.common.policies import AsymmetricPolicy
+
+Metrics = dict[str, th.Tensor]
+
+
+class Batch(NamedTuple):
+    """
+    A batch of transitions.
+
+    :param observations: dict of entries, B of each
+    :param actions: in [-1, 1], shape (B, A)
+    :param rewards: shape (B,)
+    :param next_observations: dict of entries, B of each
+    :param dones: 1 where the episode terminated, 0 where it went on or ran into its time limit, shape (B,)
+    :param discounts: gamma to the number of steps that the reward sums up, scalar or shape (B,)
+    """
+
+    observations: PyTorchObs
+    actions: th.Tensor
+    rewards: th.Tensor
+    next_observations: PyTorchObs
+    dones: th.Tensor
+    discounts: th.Tensor | float
+
+
+class NetworkTraining(OffPolicyAlgorithm):
+    """
+    ``train`` for networks that are laid out flat, each with its optimiser: a subclass writes one gradient step.
+
+    The attributes below are those of :class:`sb3_gac.common.off_policy.AsymmetricOffPolicyAlgorithm`.
+    """
+
+    policy: AsymmetricPolicy
+    tau: float
+    target_update_interval: int
+    max_grad_norm: float | None
+    _halves_are_independent: bool
+    _halves_together = False
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """
+        :param gradient_steps: number of gradient steps
+        :param batch_size: transitions per step, B
+        """
+        self.policy.set_training_mode(True)
+        self.policy.refresh_parameters()
+        self._update_learning_rate(self._scheduled_optimizers())
+        self._halves_together = self._halves_are_independent and th.get_num_threads() > 1
+        with halved_threads(self._halves_together):
+            history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
+        self._record_metrics(history)
+
+    def _one_update(self, batch_size: int, diagnose: bool) -> Metrics:
+        metrics = self._gradient_step(self._sample_batch(batch_size), diagnose)
+        self._n_updates += 1
+        if self._n_updates % self.target_update_interval == 0:
+            self.policy.update_targets(self.tau)
+        return metrics
+
+    def _run_halves(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
+        """
+        :param tasks: independent of each other, see :func:`run_halves`
+        :return: their results
+        """
+        return run_halves(tasks, self._halves_together)
+
+    def _fit_critics(self, name: str, batch: Batch, target: th.Tensor) -> Metrics:
+        """
+        One step of an ensemble towards its Bellman targets.
+
+        :param name: attribute of the policy
+        :param batch: B transitions
+        :param target: shape (B,)
+        :return: loss, mean Q and gradient norm, named after the ensemble
+        """
+        q = getattr(self.policy, name)(batch.observations, batch.actions)
+        return {f"{name}_q": q.detach().mean()} | self._descend(name, critic_loss(q, target))
+
+    def _descend(self, name: str, loss: th.Tensor, unclipped_loss: th.Tensor | float = 0.0) -> Metrics:
+        """
+        One step of a network's optimiser; whatever else the loss went through stays as it is.
+
+        :param name: attribute of the policy
+        :param loss: scalar
+        :param unclipped_loss: of parameters that have no say in the clipping
+        :return: loss and gradient norm, named after the network
+        """
+        parameters = self.policy.flat_parameters[name]
+        parameters.backward(loss + unclipped_loss)
+        grad_norm = parameters.clip_gradient(self.max_grad_norm)
+        getattr(self.policy, name).optimizer.step()
+        return {f"{name}_loss": loss.detach(), f"{name}_grad_norm": grad_norm}
+
+    @abstractmethod
+    def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
+        """
+        One update of all networks but the targets.
+
+        :param batch: B transitions
+        :param diagnose: whether to add what costs extra, as on the last of a round
+        :return: detached tensors of shape () to log under "train/", left on the device
+        """
+
+    def _sample_batch(self, batch_size: int) -> Batch:
+        assert self.replay_buffer is not None
+        samples = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+        return Batch(
+            samples.observations,
+            samples.actions,
+            samples.rewards.flatten(),
+            samples.next_observations,
+            samples.dones.flatten(),
+            self.gamma if samples.discounts is None else samples.discounts.flatten(),
+        )
+
+    @abstractmethod
+    def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
+        """Optimisers that follow ``learning_rate``."""
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        """Follow the schedule; a parameter group's "lr_scale" multiplies it."""
+        super()._update_learning_rate(optimizers)
+        for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
+            for group in optimizer.param_groups:
+                group["lr"] *= group.get("lr_scale", 1.0)
+
+    def _record_metrics(self, history: list[Metrics]) -> None:
+        """Log means over the gradient steps of one ``train()``, and diagnostics of the last: the only host transfer."""
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if not history:
+            return
+        names, last = list(history[0]), history[-1]
+        means = th.stack([th.stack([step[name] for name in names]) for step in history]).mean(dim=0)
+        diagnostics = [name for name in last if name not in names]
+        means = th.cat([means, *(last[name].reshape(1) for name in diagnostics)])
+        values = dict(zip([*names, *diagnostics], means.tolist(), strict=True))
+        values["actor_loss"] = values[f"{self.policy.roles.deployed}_loss"]  # SB3's names for the two
+        values["critic_loss"] = sum(value for name, value in values.items() if name.endswith("critic_loss"))
+        for name, value in values.items():
+            self.logger.record(f"train/{name}", value)
