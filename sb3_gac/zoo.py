@@ -1,0 +1,120 @@
+"""
+rl_zoo3 with the algorithms of this package::
+
+    python -m sb3_gac.zoo train --algo gac --env sb3_gac/HalfCheetah-v5 --env-kwargs noise_std:0.1
+    python -m sb3_gac.zoo train --algo gac --env sb3_gac/HalfCheetah-v5 -optimize --n-trials 50
+    python -m sb3_gac.zoo enjoy --algo gac --env sb3_gac/HalfCheetah-v5 --folder logs
+    python -m sb3_gac.zoo record_video --algo gac --env sb3_gac/HalfCheetah-v5 --folder logs
+
+Every option is rl_zoo3's.  Hyperparameters come from ``sb3_gac/zoo_hyperparams`` unless ``--conf-file`` names others.
+"""
+
+import argparse
+import runpy
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+from rl_zoo3 import hyperparams_opt, utils
+from rl_zoo3.enjoy import enjoy
+from rl_zoo3.train import train
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_gac import GAC, AsymmetricSAC
+
+HYPERPARAMS = Path(__file__).parent / "zoo_hyperparams"
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"gac": GAC, "asymmetric_sac": AsymmetricSAC}
+_NET_ARCHS = {"small": [128, 128], "medium": [256, 256], "large": [400, 300]}
+
+
+def sample_asymmetric_sac(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Arguments of AsymmetricSAC for one trial of ``-optimize``.
+
+    :param trial: of Optuna
+    :param n_actions: unused, see rl_zoo3
+    :param n_envs: unused
+    :param additional_args: unused
+    """
+    return convert(_suggest_shared(trial))
+
+
+def sample_gac(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Arguments of GAC for one trial of ``-optimize``: those of AsymmetricSAC, and how far the guider may go.
+
+    :param trial: of Optuna
+    :param n_actions: unused, see rl_zoo3
+    :param n_envs: unused
+    :param additional_args: unused
+    """
+    target_kl = trial.suggest_float("target_kl", 3e-4, 0.1, log=True)
+    kl_coef_learning_rate = trial.suggest_float("kl_coef_learning_rate", 3e-4, 3e-2, log=True)
+    return convert(_suggest_shared(trial) | {"target_kl": target_kl, "kl_coef_learning_rate": kl_coef_learning_rate})
+
+
+def _suggest_shared(trial: optuna.Trial) -> dict[str, Any]:
+    return {
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-3, 0.05, log=True),
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 9),
+        "tau": trial.suggest_float("tau", 1e-3, 0.05, log=True),
+        "target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"]),
+        "net_arch": trial.suggest_categorical("net_arch", list(_NET_ARCHS)),
+    }
+
+
+def convert(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: values as a trial stores them
+    :return: arguments of the algorithm
+    """
+    arguments = dict(sampled_params)
+    arguments["gamma"] = 1 - arguments.pop("one_minus_gamma")
+    arguments["batch_size"] = 2 ** arguments.pop("batch_size_pow")
+    arguments["policy_kwargs"] = {"net_arch": _NET_ARCHS[arguments.pop("net_arch")]}
+    return arguments
+
+
+def register() -> None:
+    """Make the algorithms known to rl_zoo3."""
+    utils.ALGOS.update(ALGORITHMS)
+    hyperparams_opt.HYPERPARAMS_SAMPLER.update(gac=sample_gac, asymmetric_sac=sample_asymmetric_sac)
+    hyperparams_opt.HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert))
+
+
+def record_video() -> None:
+    """rl_zoo3's script has no function to call."""
+    runpy.run_module("rl_zoo3.record_video", run_name="__main__")
+
+
+SCRIPTS: dict[str, Callable[[], None]] = {"train": train, "enjoy": enjoy, "record_video": record_video}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    Command line.
+
+    :param arguments: a script's name and its options, by default the process's
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("script", choices=list(SCRIPTS))
+    own, options = parser.parse_known_args(list(sys.argv[1:] if arguments is None else arguments)[:1])
+    options = list(sys.argv[2:] if arguments is None else arguments[1:])
+    register()
+    if own.script == "train" and not {"-conf", "--conf-file"} & set(options):
+        options += ["--conf-file", str(HYPERPARAMS / f"{_algorithm(options)}.yml")]
+    sys.argv = [f"{sys.argv[0]} {own.script}", *options]
+    SCRIPTS[own.script]()
+
+
+def _algorithm(options: list[str]) -> str:
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo", default="gac", choices=list(ALGORITHMS))
+    return parser.parse_known_args(options)[0].algo
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""rl_zoo3 with our algorithms: train, optimise, enjoy and record, as its users call them."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+pytest.importorskip("rl_zoo3")
+
+from sb3_gac import envs
+from sb3_gac.zoo import ALGORITHMS, HYPERPARAMS, convert
+
+ENV = "sb3_gac/InvertedDoublePendulum-v5"
+QUICK = ["learning_starts:20", "batch_size:8", "policy_kwargs:dict(net_arch=[8])", "n_envs:1", "gradient_steps:1"]
+
+
+def _zoo(script, folder, *options):
+    command = [sys.executable, "-m", "sb3_gac.zoo", script, "--env", ENV, *map(str, options)]
+    environment = {**os.environ, "MUJOCO_GL": "egl", "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-4000:]
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder in which each algorithm was trained for a moment."""
+    folder = tmp_path_factory.mktemp("zoo")
+    for algorithm in ALGORITHMS:
+        options = ("--algo", algorithm, "-n", 120, "--env-kwargs", "noise_std:0.2", "--eval-freq", 60, "--eval-episodes", 1)
+        _zoo("train", folder, *options, "-params", *QUICK)
+    return folder
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_train_saves_what_the_zoo_saves(trained, algorithm):
+    (run,) = (trained / "logs" / algorithm).iterdir()
+    files = {path.name for path in run.rglob("*")}
+    assert {"best_model.zip", "config.yml", "args.yml", "evaluations.npz"} <= files
+    config = next(run.rglob("config.yml")).read_text()
+    assert "MultiInputPolicy" in config
+    assert "privileged" in config, "from our YAML: critics on the state alone"
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_enjoy_runs_the_deployed_policy(trained, algorithm):
+    output = _zoo("enjoy", trained, "--algo", algorithm, "--folder", "logs", "-n", 50, "--no-render")
+    assert "Mean reward" in output
+
+
+def test_record_video_writes_one(trained):
+    _zoo("record_video", trained, "--algo", "gac", "--folder", "logs", "-n", 20)
+    assert list(trained.rglob("*.mp4"))
+
+
+def test_optimize_samples_and_trains(trained):
+    options = (
+        "--algo",
+        "gac",
+        "-n",
+        60,
+        "-optimize",
+        "--n-trials",
+        2,
+        "--n-jobs",
+        1,
+        "--no-optim-plots",
+        "--eval-episodes",
+        1,
+    )
+    output = _zoo("train", trained, *options, "--n-evaluations", 1, "-params", "learning_starts:20", "n_envs:1")
+    assert "target_kl" in output
+
+
+def test_sampled_values_become_arguments():
+    sampled = {"one_minus_gamma": 0.01, "batch_size_pow": 7, "net_arch": "small", "tau": 0.01}
+    assert convert(sampled) == {"gamma": 0.99, "batch_size": 128, "policy_kwargs": {"net_arch": [128, 128]}, "tau": 0.01}
+    assert sampled["net_arch"] == "small", "left as the trial stored it"
+
+
+def test_every_registered_task_has_hyperparameters():
+    for algorithm in ALGORITHMS:
+        settings = yaml.safe_load((HYPERPARAMS / f"{algorithm}.yml").read_text())
+        assert {f"sb3_gac/{task}-v5" for task in envs.mujoco.TASKS} <= set(settings)
+        assert Path(HYPERPARAMS / f"{algorithm}.yml").is_file()
