@@ -107,7 +107,7 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         action, log_prob = actor.sample_with_log_prob()
         q = self.policy.critic(batch.observations, action)
         metrics |= self._descend("actor", learner_loss(0.0, q, 0.0, log_prob, ent_coef))
-        metrics["ent_coef_loss"] = self.ent_coef_dual.update(log_prob.detach() + float(self.target_entropy))
+        metrics |= self.ent_coef_dual.update(log_prob.detach() + float(self.target_entropy))
         if diagnose:
             metrics["ent_coef"] = self.ent_coef_dual.value
             metrics["entropy"] = -log_prob.detach().mean()

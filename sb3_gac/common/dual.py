@@ -21,9 +21,9 @@ class FixedCoefficient:
         self.optimizer: th.optim.Optimizer | None = None
         self.state_names: tuple[list[str], list[str]] = ([], ["value"])
 
-    def update(self, violation: th.Tensor) -> th.Tensor:
-        """Nothing to learn: a loss of zero."""
-        return th.zeros_like(self.value)
+    def update(self, violation: th.Tensor) -> dict[str, th.Tensor]:
+        """Nothing to learn, and no loss."""
+        return {}
 
     def on_bound(self) -> th.Tensor:
         """It has none: zero."""
@@ -34,13 +34,15 @@ class DualVariable:
     """
     A positive coefficient learned in log space by gradient steps on :func:`dual_loss`, kept inside bounds.
 
+    :param name: what its loss is named after
     :param initial: start value, inside the bounds
     :param bounds: smallest and largest value
     :param learning_rate: Adam's, on the logarithm
     :param device: where its tensor lives
     """
 
-    def __init__(self, initial: float, bounds: tuple[float, float], learning_rate: float, device: th.device):
+    def __init__(self, name: str, initial: float, bounds: tuple[float, float], learning_rate: float, device: th.device):
+        self.name = name
         self.bounds = bounds
         self._log_bounds = (math.log(bounds[0]), math.log(bounds[1]))
         self.log_value = th.full((1,), math.log(initial), device=device, requires_grad=True)
@@ -58,12 +60,12 @@ class DualVariable:
         log_value = self.log_value.detach().squeeze(0)
         return ((log_value <= low) | (log_value >= high)).float()
 
-    def update(self, violation: th.Tensor) -> th.Tensor:
+    def update(self, violation: th.Tensor) -> dict[str, th.Tensor]:
         """
         One gradient step: up while the mean violation is positive, down while it is negative.
 
         :param violation: constraint violation per sample, shape (\\*E)
-        :return: loss, detached, scalar
+        :return: loss to log, detached, scalar
         """
         assert self.optimizer is not None
         with th.no_grad():
@@ -71,7 +73,7 @@ class DualVariable:
             self.log_value.grad = loss.view(1)  # d/dx (-exp(x) v) = -exp(x) v: the gradient is the loss itself
             self.optimizer.step()
             self.log_value.clamp_(*self._log_bounds)
-        return loss
+        return {f"{self.name}_loss": loss}
 
 
 Coefficient = FixedCoefficient | DualVariable
@@ -103,7 +105,7 @@ def make_coefficient(
     initial = auto_value if spec == "auto" else _parse(spec.removeprefix("auto_"), remedy, allow_zero=False)
     if spec != "auto" and not low <= initial <= high:
         raise ValueError(f"The start value of {name}={spec!r} lies outside {name}_bounds={bounds}.")
-    return DualVariable(min(max(initial, low), high), (low, high), learning_rate, device)
+    return DualVariable(name, min(max(initial, low), high), (low, high), learning_rate, device)
 
 
 def check_bounds(name: str, bounds: Any) -> tuple[float, float]:

@@ -61,8 +61,8 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
             [lambda: self._guider_half(inputs, noise[:2]), lambda: self._learner_half(inputs, noise[2:])]
         )
         metrics = guider_metrics | learner_metrics
-        metrics["ent_coef_loss"] = self.ent_coef_dual.update(log_prob + float(self.target_entropy))
-        metrics["kl_coef_loss"] = self.kl_coef_dual.update(kl - self.current_target_kl)
+        metrics |= self.ent_coef_dual.update(log_prob + float(self.target_entropy))
+        metrics |= self.kl_coef_dual.update(kl - self.current_target_kl)
         metrics["kl"] = kl.mean()
         return metrics | self._diagnostics(inputs, kl, log_prob) if diagnose else metrics
 
