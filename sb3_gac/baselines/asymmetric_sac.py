@@ -10,12 +10,13 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_gac.common.actors import LOG_STD_BOUNDS, DeployedPolicy
+from sb3_gac.common.compilation import compilable
 from sb3_gac.common.distributions import TanhGaussian
 from sb3_gac.common.losses import learner_loss, learner_target
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.common.policies import AsymmetricPolicy
 from sb3_gac.common.roles import Roles
-from sb3_gac.common.training import Batch, Metrics
+from sb3_gac.common.training import Batch, Descent, Metrics
 
 
 class SquashedGaussianActor(DeployedPolicy):
@@ -102,20 +103,32 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
     def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
         """SAC's critics are eq. 15's with the entropy term, its actor eq. 16's without a guider."""
         ent_coef = self.ent_coef_dual.value
-        metrics = self._fit_critics("critic", batch, self._target(batch, ent_coef))
-        actor = self.policy.actor.distribution(batch.observations)
-        action, log_prob = actor.sample_with_log_prob()
-        q = self.policy.critic(batch.observations, action)
-        metrics |= self._descend("actor", learner_loss(0.0, q, 0.0, log_prob, ent_coef))
-        metrics |= self.ent_coef_dual.update(log_prob.detach() + float(self.target_entropy))
+        noise = th.randn((2, *batch.actions.shape), device=self.device)
+        metrics = self._step("critic", self._fit(batch, noise[0], ent_coef))
+        descent, log_prob, log_std = self._climb(batch, noise[1], ent_coef)
+        metrics |= self._step("actor", descent)
+        metrics |= self.ent_coef_dual.update(log_prob + float(self.target_entropy))
         if diagnose:
             metrics["ent_coef"] = self.ent_coef_dual.value
-            metrics["entropy"] = -log_prob.detach().mean()
-            metrics["std"] = actor.log_std.detach().exp().mean()
+            metrics["entropy"] = -log_prob.mean()
+            metrics["std"] = log_std.exp().mean()
         return metrics
 
+    @compilable
+    def _fit(self, batch: Batch, noise: th.Tensor, ent_coef: th.Tensor) -> Descent:
+        return self._critic_descent("critic", batch, self._target(batch, noise, ent_coef))
+
     @th.no_grad()
-    def _target(self, batch: Batch, ent_coef: th.Tensor) -> th.Tensor:
-        action, log_prob = self.policy.actor.distribution(batch.next_observations).sample_with_log_prob()
+    def _target(self, batch: Batch, noise: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
+        action, log_prob = self.policy.actor.distribution(batch.next_observations).sample_with_log_prob(noise)
         next_q = self.policy.critic_target(batch.next_observations, action)
         return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, ent_coef)
+
+    @compilable
+    def _climb(self, batch: Batch, noise: th.Tensor, ent_coef: th.Tensor) -> tuple[Descent, th.Tensor, th.Tensor]:
+        """The actor's descent, its log-probability (B,) and log standard deviation (B, A), detached."""
+        actor = self.policy.actor.distribution(batch.observations)
+        action, log_prob = actor.sample_with_log_prob(noise)
+        q = self.policy.critic(batch.observations, action)
+        descent = self._descent("actor", learner_loss(0.0, q, 0.0, log_prob, ent_coef))
+        return descent, log_prob.detach(), actor.log_std.detach()

@@ -1,7 +1,7 @@
 """Tanh-squashed diagonal Gaussians: sampling, log-probability, and the KL divergence of two that share a std."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch as th
 import torch.nn.functional as F
@@ -10,8 +10,7 @@ KL_REDUCTIONS = ("mean", "sum")
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
-@dataclass(frozen=True)
-class TanhGaussian:
+class TanhGaussian(NamedTuple):
     """
     tanh(N(mean, exp(log_std)^2)), independent per action dimension.
 

@@ -17,7 +17,7 @@ class FlatParameters:
     Makes the parameters views of one flat parameter, which is what an optimiser is given.
 
     :param parameters: of one network, all of one dtype and on one device
-    :param unclipped: how many of the last ones have no say in :meth:`clip_gradient`
+    :param unclipped: how many of the last ones have no say in :meth:`gradient`'s norm and its bound
     :raises ValueError: if there are none, or of several dtypes
     """
 
@@ -43,28 +43,21 @@ class FlatParameters:
             self.flat.data = self._joined(self.parameters)
             self._point_parameters_here()
 
-    def backward(self, loss: th.Tensor) -> None:
+    def gradient(self, loss: th.Tensor, max_norm: float | None) -> tuple[th.Tensor, th.Tensor]:
         """
-        Leave the gradient of the loss with respect to these parameters, and no others, in ``flat.grad``.
+        The loss's gradient with respect to these parameters, and no others.
 
         :param loss: scalar
+        :param max_norm: scale the gradient to a norm of at most this; ``None`` leaves it as it is
+        :return: gradient in the order of ``flat``, zero where there is none; its norm before, scalar
         """
-        gradients = th.autograd.grad(loss, self.parameters, allow_unused=True, materialize_grads=True)
-        self.flat.grad = self._joined(gradients)
-
-    def clip_gradient(self, max_norm: float | None) -> th.Tensor:
-        """
-        Scale the gradient in place to a norm of at most ``max_norm``, without waiting for the device.
-
-        :param max_norm: ``None`` leaves the gradient as it is
-        :return: norm before clipping, scalar
-        """
-        assert self.flat.grad is not None
-        gradient = self.flat.grad[: self._clipped_end]
-        norm = th.linalg.vector_norm(gradient)
+        gradients = th.autograd.grad(loss, self.parameters, allow_unused=True)
+        pairs = zip(gradients, self.parameters, strict=True)
+        joined = self._joined([th.zeros_like(parameter) if gradient is None else gradient for gradient, parameter in pairs])
+        norm = th.linalg.vector_norm(joined[: self._clipped_end])
         if max_norm is not None:
-            gradient.mul_((max_norm / (norm + 1e-6)).clamp_(max=1.0))
-        return norm
+            joined[: self._clipped_end] *= (max_norm / (norm + 1e-6)).clamp(max=1.0)
+        return joined, norm
 
     @staticmethod
     @th.no_grad()

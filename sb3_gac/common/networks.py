@@ -110,7 +110,7 @@ class EnsembleLinear(nn.Module):
         :param x: shape (N, B, F)
         :return: shape (N, B, H)
         """
-        return th.baddbmm(self.bias, x, self.weight)
+        return th.bmm(x, self.weight).add_(self.bias)
 
 
 class EnsembleInput(nn.Module):
@@ -138,8 +138,8 @@ class EnsembleInput(nn.Module):
         :return: shape (N, B, H)
         """
         n_members = len(self.bias)
-        x = th.baddbmm(self.bias, features.expand(n_members, *features.shape), self.features_weight)
-        return th.baddbmm(x, actions.expand(n_members, *actions.shape), self.actions_weight)
+        x = th.bmm(features.expand(n_members, *features.shape), self.features_weight)
+        return x.baddbmm_(actions.expand(n_members, *actions.shape), self.actions_weight).add_(self.bias)
 
 
 class EnsembleOutput(nn.Module):

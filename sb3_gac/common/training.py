@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_gac.common.compilation import Program
 from sb3_gac.common.losses import critic_loss
 from sb3_gac.common.parallel import halved_threads, run_halves
 from sb3_gac.common.policies import AsymmetricPolicy
@@ -32,7 +33,19 @@ class Batch(NamedTuple):
     rewards: th.Tensor
     next_observations: PyTorchObs
     dones: th.Tensor
-    discounts: th.Tensor | float
+    discounts: th.Tensor
+
+
+class Descent(NamedTuple):
+    """
+    What a loss asks of a network.
+
+    :param gradient: with respect to its flat parameters
+    :param metrics: loss, gradient norm and whatever else is to be logged, detached
+    """
+
+    gradient: th.Tensor
+    metrics: Metrics
 
 
 class NetworkTraining(OffPolicyAlgorithm):
@@ -46,6 +59,9 @@ class NetworkTraining(OffPolicyAlgorithm):
     tau: float
     target_update_interval: int
     max_grad_norm: float | None
+    compile: bool
+    programs: dict[Any, Program]
+    program_key: tuple[Any, ...]
     _halves_are_independent: bool
     _halves_together = False
 
@@ -57,10 +73,15 @@ class NetworkTraining(OffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self.policy.refresh_parameters()
         self._update_learning_rate(self._scheduled_optimizers())
+        self.program_key = (batch_size, self.policy, *self._settings())
         self._halves_together = self._halves_are_independent and th.get_num_threads() > 1
         with halved_threads(self._halves_together):
             history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
         self._record_metrics(history)
+
+    def _settings(self) -> list[bool | float | str]:
+        """Arguments that a compiled gradient step may have taken for constants."""
+        return [value for name, value in vars(self).items() if name[0] != "_" and isinstance(value, (bool, float, str))]
 
     def _one_update(self, batch_size: int, diagnose: bool) -> Metrics:
         metrics = self._gradient_step(self._sample_batch(batch_size), diagnose)
@@ -76,32 +97,42 @@ class NetworkTraining(OffPolicyAlgorithm):
         """
         return run_halves(tasks, self._halves_together)
 
-    def _fit_critics(self, name: str, batch: Batch, target: th.Tensor) -> Metrics:
+    def _descent(self, name: str, loss: th.Tensor, unclipped_loss: th.Tensor | float = 0.0) -> Descent:
         """
-        One step of an ensemble towards its Bellman targets.
-
-        :param name: attribute of the policy
-        :param batch: B transitions
-        :param target: shape (B,)
-        :return: loss, mean Q and gradient norm, named after the ensemble
-        """
-        q = getattr(self.policy, name)(batch.observations, batch.actions)
-        return {f"{name}_q": q.detach().mean()} | self._descend(name, critic_loss(q, target))
-
-    def _descend(self, name: str, loss: th.Tensor, unclipped_loss: th.Tensor | float = 0.0) -> Metrics:
-        """
-        One step of a network's optimiser; whatever else the loss went through stays as it is.
+        The way down a loss for one network, whatever else the loss went through.
 
         :param name: attribute of the policy
         :param loss: scalar
         :param unclipped_loss: of parameters that have no say in the clipping
-        :return: loss and gradient norm, named after the network
+        :return: with loss and gradient norm, named after the network
         """
-        parameters = self.policy.flat_parameters[name]
-        parameters.backward(loss + unclipped_loss)
-        grad_norm = parameters.clip_gradient(self.max_grad_norm)
+        gradient, norm = self.policy.flat_parameters[name].gradient(loss + unclipped_loss, self.max_grad_norm)
+        return Descent(gradient, {f"{name}_loss": loss.detach(), f"{name}_grad_norm": norm})
+
+    def _critic_descent(self, name: str, batch: Batch, target: th.Tensor) -> Descent:
+        """
+        An ensemble's way towards its Bellman targets.
+
+        :param name: attribute of the policy
+        :param batch: B transitions
+        :param target: shape (B,)
+        :return: with loss, mean Q and gradient norm, named after the ensemble
+        """
+        q = getattr(self.policy, name)(batch.observations, batch.actions)
+        gradient, metrics = self._descent(name, critic_loss(q, target))
+        return Descent(gradient, {f"{name}_q": q.detach().mean()} | metrics)
+
+    def _step(self, name: str, descent: Descent) -> Metrics:
+        """
+        One step of a network's optimiser.
+
+        :param name: attribute of the policy
+        :param descent: of that network
+        :return: its metrics
+        """
+        self.policy.flat_parameters[name].flat.grad = descent.gradient
         getattr(self.policy, name).optimizer.step()
-        return {f"{name}_loss": loss.detach(), f"{name}_grad_norm": grad_norm}
+        return descent.metrics
 
     @abstractmethod
     def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
@@ -122,7 +153,7 @@ class NetworkTraining(OffPolicyAlgorithm):
             samples.rewards.flatten(),
             samples.next_observations,
             samples.dones.flatten(),
-            self.gamma if samples.discounts is None else samples.discounts.flatten(),
+            th.full((), self.gamma, device=self.device) if samples.discounts is None else samples.discounts.flatten(),
         )
 
     @abstractmethod

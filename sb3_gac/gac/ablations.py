@@ -6,6 +6,7 @@ import torch as th
 
 from sb3_gac.common.losses import distillation_loss
 from sb3_gac.gac.gac import GAC
+from sb3_gac.gac.policies import ActionDistributions
 from sb3_gac.gac.update import StepInputs
 
 
@@ -19,5 +20,5 @@ class GACShare(GAC):
 class GACWithoutQ(GACShare):
     """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14)."""
 
-    def _learner_loss(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
-        return distillation_loss(self._kl(inputs.now.guider.detach(), inputs.now.learner))
+    def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
+        return distillation_loss(self._kl(now.guider.detach(), now.learner))

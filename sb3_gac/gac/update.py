@@ -6,11 +6,12 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.utils import FloatSchedule
 
+from sb3_gac.common.compilation import compilable
 from sb3_gac.common.distributions import TanhGaussian, kl_shared_std
 from sb3_gac.common.dual import Coefficient
 from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target, log_std_loss
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
-from sb3_gac.common.training import Batch, Metrics
+from sb3_gac.common.training import Batch, Descent, Metrics
 from sb3_gac.gac.policies import ActionDistributions, ActorOutputs, GACPolicy
 
 
@@ -19,24 +20,19 @@ class StepInputs(NamedTuple):
     What both halves of a gradient step read and neither changes.
 
     :param batch: B transitions
-    :param now: the policies on the observations
-    :param later: the policies on the next observations, as constants
+    :param guider: what its network computes on the observations
+    :param learner: the same
+    :param later: what both networks compute on the next observations, as constants
     :param kl_coef: alpha
     :param ent_coef: beta
     """
 
     batch: Batch
-    now: ActionDistributions
-    later: ActionDistributions
+    guider: ActorOutputs
+    learner: ActorOutputs
+    later: tuple[ActorOutputs, ActorOutputs]
     kl_coef: th.Tensor
     ent_coef: th.Tensor
-
-
-def _on_both(network: th.nn.Module, batch: Batch) -> tuple[ActorOutputs, ActorOutputs]:
-    """A policy's outputs on the observations, and, as constants, on the next ones."""
-    now = network(batch.observations)
-    with th.no_grad():
-        return now, network(batch.next_observations)
 
 
 class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
@@ -56,7 +52,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
         """The two halves share nothing that either changes, so they may run at once; the targets follow in :meth:`train`."""
         inputs = self._run_policies(batch)
-        noise = th.randn((4, *inputs.now.learner.mean.shape), device=self.device)
+        noise = th.randn((4, *batch.actions.shape), device=self.device)
         (guider_metrics, kl, log_prob), learner_metrics = self._run_halves(
             [lambda: self._guider_half(inputs, noise[:2]), lambda: self._learner_half(inputs, noise[2:])]
         )
@@ -72,11 +68,22 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         return self.target_kl_schedule(self._current_progress_remaining)
 
     def _run_policies(self, batch: Batch) -> StepInputs:
-        guider, learner = self._run_halves(
-            [lambda: _on_both(self.policy.guider, batch), lambda: _on_both(self.policy.learner, batch)]
+        (guider, next_guider), (learner, next_learner) = self._run_halves(
+            [lambda: self._on_both("guider", batch), lambda: self._on_both("learner", batch)]
         )
-        now, later = (self.policy.combine(*outputs) for outputs in zip(guider, learner, strict=True))
-        return StepInputs(batch, now, later, self.kl_coef_dual.value, self.ent_coef_dual.value)
+        return StepInputs(batch, guider, learner, (next_guider, next_learner), self.kl_coef_dual.value, self.ent_coef_dual.value)
+
+    @compilable
+    def _on_both(self, name: str, batch: Batch) -> tuple[ActorOutputs, ActorOutputs]:
+        """A policy's outputs on the observations, and, as constants, on the next ones."""
+        network = getattr(self.policy, name)
+        now = network(batch.observations)
+        with th.no_grad():
+            return now, network(batch.next_observations)
+
+    def _outputs(self, name: str, inputs: StepInputs) -> ActorOutputs:
+        """What a policy computes on the observations; compiled code can differentiate only what it computes itself."""
+        return getattr(self.policy, name)(inputs.batch.observations) if self.compile else getattr(inputs, name)
 
     # --- the guider's half ------------------------------------------------------------------------------------------
 
@@ -88,18 +95,28 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         :param noise: standard normal, for the next action and for the present one, shape (2, B, A)
         :return: metrics; KL(guider || learner) and the guider's log-probability, detached, each of shape (B,)
         """
-        batch, now = inputs.batch, inputs.now
-        metrics = self._fit_critics("guider_critic", batch, self._guided_target(inputs, noise[0]))
-        action, log_prob = now.guider.sample_with_log_prob(noise[1])
+        metrics = self._step("guider_critic", self._guider_critic_descent(inputs, noise[0]))
+        descent, kl, log_prob = self._guider_descent(inputs, noise[1])
+        return metrics | self._step("guider", descent), kl, log_prob
+
+    @compilable
+    def _guider_critic_descent(self, inputs: StepInputs, noise: th.Tensor) -> Descent:
+        return self._critic_descent("guider_critic", inputs.batch, self._guided_target(inputs, noise))
+
+    @compilable
+    def _guider_descent(self, inputs: StepInputs, noise: th.Tensor) -> tuple[Descent, th.Tensor, th.Tensor]:
+        """Eq. 13; with KL(guider || learner) and the guider's log-probability, detached, each of shape (B,)."""
+        now = self.policy.combine(self._outputs("guider", inputs), inputs.learner)
+        action, log_prob = now.guider.sample_with_log_prob(noise)
         kl = self._kl(now.guider, now.learner.detach())
-        q = self.policy.guider_critic(batch.observations, action)
+        q = self.policy.guider_critic(inputs.batch.observations, action)
         loss = guider_loss(kl, log_prob, q, inputs.kl_coef, inputs.ent_coef)
-        return metrics | self._descend("guider", loss), kl.detach(), log_prob.detach()
+        return self._descent("guider", loss), kl.detach(), log_prob.detach()
 
     @th.no_grad()
     def _guided_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
         """Eq. 12, shape (B,)."""
-        batch, later = inputs.batch, inputs.later
+        batch, later = inputs.batch, self.policy.combine(*inputs.later)
         action, log_prob = later.guider.sample_with_log_prob(noise)
         next_q = self.policy.guider_critic_target(batch.next_observations, action)
         next_kl = self._kl(later.guider, later.learner)
@@ -118,28 +135,37 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         """
         metrics: Metrics = {}
         if self.policy.learner_critic is not None:
-            metrics = self._fit_critics("learner_critic", inputs.batch, self._learner_target(inputs, noise[0]))
-        deployment_loss = log_std_loss(inputs.now.deployment_log_std, inputs.now.learner.log_std)
-        metrics |= self._descend("learner", self._learner_loss(inputs, noise[1]), deployment_loss)
-        return metrics | {"log_std_loss": deployment_loss.detach()}
+            metrics = self._step("learner_critic", self._learner_critic_descent(inputs, noise[0]))
+        return metrics | self._step("learner", self._learner_descent(inputs, noise[1]))
+
+    @compilable
+    def _learner_critic_descent(self, inputs: StepInputs, noise: th.Tensor) -> Descent:
+        return self._critic_descent("learner_critic", inputs.batch, self._learner_target(inputs, noise))
+
+    @compilable
+    def _learner_descent(self, inputs: StepInputs, noise: th.Tensor) -> Descent:
+        now = self.policy.combine(inputs.guider, self._outputs("learner", inputs))
+        deployment_loss = log_std_loss(now.deployment_log_std, now.learner.log_std)
+        gradient, metrics = self._descent("learner", self._learner_loss(inputs, now, noise), deployment_loss)
+        return Descent(gradient, metrics | {"log_std_loss": deployment_loss.detach()})
 
     @th.no_grad()
     def _learner_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
         """Eq. 15, shape (B,)."""
         batch = inputs.batch
-        action, log_prob = inputs.later.learner.sample_with_log_prob(noise)
+        action, log_prob = self.policy.combine(*inputs.later).learner.sample_with_log_prob(noise)
         next_q = self.policy.critic_target(batch.next_observations, action)
         return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, self._learner_ent_coef(inputs))
 
-    def _learner_loss(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
+    def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
         """
         Eq. 16, with the learner's critics, or the guided ones where it has none.
 
         :param inputs: of this step
+        :param now: the policies on the observations, with the learner's gradients
         :param noise: standard normal, shape (B, A)
         :return: scalar
         """
-        now = inputs.now
         action, log_prob = now.learner.sample_with_log_prob(noise)
         q = self.policy.critic(inputs.batch.observations, action)
         kl: th.Tensor | float = 0.0
@@ -157,7 +183,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         return kl_shared_std(guider.mean, learner.mean, learner.log_std.exp(), self.kl_reduction)
 
     def _diagnostics(self, inputs: StepInputs, kl: th.Tensor, log_prob: th.Tensor) -> Metrics:
-        target, learner = self.current_target_kl, inputs.now.learner
+        target, learner = self.current_target_kl, self.policy.combine(inputs.guider, inputs.learner).learner
         return {
             "kl_p95": kl.kthvalue(math.ceil(0.95 * kl.numel())).values,
             "kl_above_target": (kl > target).float().mean(),

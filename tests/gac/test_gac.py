@@ -28,10 +28,10 @@ def _numpy_state(policy):
     return {name: p.detach().double().numpy() for name, p in policy.named_parameters()}
 
 
-def _inputs(obs, now, kl_coef=1.0, ent_coef=1.0):
-    """Of a gradient step, as far as the policies' losses look at them."""
+def _inputs(obs, kl_coef=1.0, ent_coef=1.0):
+    """Of a gradient step, as far as the learner's loss looks at them."""
     batch = Batch(obs, None, None, obs, None, 0.99)
-    return StepInputs(batch, now, now, th.tensor(kl_coef), th.tensor(ent_coef))
+    return StepInputs(batch, None, None, None, th.tensor(kl_coef), th.tensor(ent_coef))
 
 
 def _mlp(x, weights, prefix, heads):
@@ -264,7 +264,7 @@ def test_learner_objective_matches_an_independent_computation(learner_entropy):
     with th.no_grad():  # a guider that differs from its learner
         model.policy.guider.mean.bias.add_(0.3)
     now, noise = model.policy.distributions(obs), th.randn(32, 1)
-    loss = model._learner_loss(_inputs(obs, now, kl_coef=0.7, ent_coef=0.2), noise).item()
+    loss = model._learner_loss(_inputs(obs, kl_coef=0.7, ent_coef=0.2), now, noise).item()
     tensors = (noise, now.learner.mean, now.learner.log_std.exp(), now.guider.mean)
     noise, mean, std, guider_mean = (x.detach().double().numpy() for x in tensors)
     kl = (((guider_mean - mean) / std) ** 2 / 2)[:, 0]
@@ -279,7 +279,7 @@ def test_without_q_the_learner_imitates_and_nothing_else():
     model = small_model(cls=GACWithoutQ)
     learner = TanhGaussian(th.zeros(2, 1), th.full((2, 1), math.log(0.5)))
     guider = TanhGaussian(th.tensor([[0.2], [0.4]]), learner.log_std)
-    loss = model._learner_loss(_inputs({}, ActionDistributions(guider, learner, learner.log_std)), th.randn(2, 1))
+    loss = model._learner_loss(_inputs({}), ActionDistributions(guider, learner, learner.log_std), th.randn(2, 1))
     assert loss.item() == pytest.approx(0.5 * (0.4**2 + 0.8**2) / 2)
 
 

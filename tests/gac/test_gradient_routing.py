@@ -111,9 +111,8 @@ def test_policy_updates_leave_no_gradient_in_the_critics(cls):
     model = _filled(cls)
     batch = model._sample_batch(32)
     inputs = model._run_policies(batch)
-    q = model.policy.guider_critic(batch.observations, inputs.now.guider.sample()).mean()
-    model._descend("guider", -q)
-    model._descend("learner", model._learner_loss(inputs, th.randn(32, 1)))
+    model._step("guider", model._guider_descent(inputs, th.randn(32, 1))[0])
+    model._step("learner", model._learner_descent(inputs, th.randn(32, 1)))
     assert all(p.grad is None for critic, _ in model.policy.critic_pairs.values() for p in critic.parameters())
 
 
@@ -153,16 +152,14 @@ def test_the_log_std_head_has_no_say_in_the_clipping_of_the_learner():
     assert [id(p) for p in flat.parameters[-2:]] == [id(p) for p in head]
     obs = _observations()
     mean, log_std = model.policy.learner(obs)
-    flat.backward(0.01 * mean.sum())
-    alone = flat.flat.grad.clone()
+    alone, _ = flat.gradient(0.01 * mean.sum(), max_norm=None)
     assert 0 < alone.norm() < 1, "not clipped by itself"
     mean, log_std = model.policy.learner(obs)
-    flat.backward(0.01 * mean.sum() + 1e6 * log_std.sum())
-    norm = flat.clip_gradient(1.0)
+    gradient, norm = flat.gradient(0.01 * mean.sum() + 1e6 * log_std.sum(), max_norm=1.0)
     n_head = sum(p.numel() for p in head)
     assert norm.item() == pytest.approx(alone.norm().item(), rel=1e-6)
-    th.testing.assert_close(flat.flat.grad[:-n_head], alone[:-n_head])
-    assert flat.flat.grad[-n_head:].norm() > 1e5, "its own is left as it is"
+    th.testing.assert_close(gradient[:-n_head], alone[:-n_head])
+    assert gradient[-n_head:].norm() > 1e5, "its own is left as it is"
 
 
 class TestSharedEncoder:
@@ -197,7 +194,7 @@ class TestSharedEncoder:
         before = encoder.detach().clone()
         inputs, noise = model._run_policies(batch), th.randn(2, 32, 1)
         model._guider_half(inputs, noise)
-        model._fit_critics("learner_critic", batch, model._learner_target(inputs, noise[0]))
+        model._step("learner_critic", model._learner_critic_descent(inputs, noise[0]))
         assert th.equal(encoder, before)
         model._learner_half(inputs, noise)
         assert not th.equal(encoder, before)
