@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_gac.common.distributions import TanhGaussian
-from sb3_gac.common.networks import RoleModel
+from sb3_gac.common.networks import Head, RoleModel
 
 LOG_STD_BOUNDS = (-5.0, 1.0)
 
@@ -63,8 +63,8 @@ class RolePolicy(RoleModel, BasePolicy):
         self.latent_net = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
         latent_dim = net_arch[-1] if net_arch else features_dim
         action_dim = get_action_dim(action_space)
-        self.mean = nn.Linear(latent_dim, action_dim)
-        self.log_std = nn.Linear(latent_dim, action_dim)
+        self.mean = Head(latent_dim, action_dim)
+        self.log_std = Head(latent_dim, action_dim)
 
     def latent(self, obs: PyTorchObs) -> th.Tensor:
         """

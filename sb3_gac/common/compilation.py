@@ -1,5 +1,5 @@
 """
-Opt-in compilation of the parts of a gradient step that change nothing: losses and their gradients.
+Opt-in compilation and mixed precision of the parts of a gradient step that change nothing: losses and their gradients.
 
 A part is traced once, forward and backward, into one graph of tensor operations, which TorchInductor compiles: everything
 between two matrix products becomes one pass over memory, and Python leaves the step.  On the CPU the code runs without
@@ -15,8 +15,8 @@ import torch as th
 from torch.utils import _pytree as pytree
 
 Method = TypeVar("Method", bound=Callable[..., Any])
-_tracing = Lock()  # one thread at a time
 _OPTIONS = {"cpu": {"cpp_wrapper": True}}
+_compiling = Lock()  # one thread at a time
 
 
 class Program:
@@ -29,21 +29,19 @@ class Program:
     """
 
     def __init__(self, function: Callable[..., Any], args: tuple[Any, ...], device_type: str):
-        from torch._inductor import compile as compile_graph  # slow to import  # noqa: PLC0415
-        from torch.fx.experimental.proxy_tensor import make_fx  # noqa: PLC0415
+        from torch._inductor import compile as compile_graph  # slow to import
+        from torch.fx.experimental.proxy_tensor import make_fx
 
-        leaves, structure = pytree.tree_flatten(args)
-        self._result_structure: Any = None
+        tensors, structure = pytree.tree_flatten(args)
 
-        def on_leaves(*tensors: th.Tensor) -> list[th.Tensor]:
+        def on_tensors(*tensors: th.Tensor) -> list[th.Tensor]:
             results, self._result_structure = pytree.tree_flatten(function(*pytree.tree_unflatten(tensors, structure)))
             return results
 
-        graph = make_fx(on_leaves)(*leaves)
+        graph = make_fx(on_tensors)(*tensors)
         self._parameters = _lift_parameters(graph)
-        inputs = [*leaves, *self._parameters]
         with th.no_grad():
-            self._run = compile_graph(graph, inputs, options=_OPTIONS.get(device_type))
+            self._run = compile_graph(graph, [*tensors, *self._parameters], options=_OPTIONS.get(device_type))
 
     def __call__(self, *args: Any) -> Any:
         """The function's value at other arguments, with the parameters as they are now."""
@@ -61,7 +59,7 @@ def _tensors(value: Any) -> list[th.Tensor]:
 
 def _lift_parameters(graph: th.fx.GraphModule) -> list[th.Tensor]:
     """Tensors that the function read without being given them become the graph's last inputs."""
-    lifted = []
+    lifted: list[th.Tensor] = []
     last_input = [node for node in graph.graph.nodes if node.op == "placeholder"][-1]
     for node in [node for node in graph.graph.nodes if node.op == "get_attr"]:
         lifted.append(getattr(graph, node.target))
@@ -77,21 +75,29 @@ def _lift_parameters(graph: th.fx.GraphModule) -> list[th.Tensor]:
 
 def compilable(method: Method) -> Method:
     """
-    Make a method run compiled on objects whose ``compile`` is true.
+    Make a method run compiled on objects whose ``compile`` is true, and in bfloat16 where ``mixed_precision`` is.
 
-    :param method: pure, of names, if any, and then tensors in tuples or dicts; its object has ``compile``, ``device`` and ``programs``
+    :param method: pure, of names, if any, and then tensors in tuples or dicts; its object has ``device``, a dict
+        ``programs``, and a ``program_key`` of all else that the method depends on
     """
+
+    @wraps(method)
+    def in_precision(self: Any, *args: Any) -> Any:
+        if not self.mixed_precision:
+            return method(self, *args)
+        with th.autocast(self.device.type, th.bfloat16, cache_enabled=False):
+            return method(self, *args)
 
     @wraps(method)
     def run(self: Any, *args: Any) -> Any:
         if not self.compile:
-            return method(self, *args)
+            return in_precision(self, *args)
         names = tuple(arg for arg in args if isinstance(arg, str))
         tensors = args[len(names) :]
         key = (method.__name__, *names, *self.program_key)
         if key not in self.programs:
-            with _tracing:
-                self.programs[key] = Program(partial(method, self, *names), tensors, self.device.type)
+            with _compiling:
+                self.programs[key] = Program(partial(in_precision, self, *names), tensors, self.device.type)
         return self.programs[key](*tensors)
 
     return run  # type: ignore[return-value]

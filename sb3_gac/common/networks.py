@@ -90,6 +90,20 @@ class RoleModel(BaseModel):
         return extractor(preprocess_obs(entries, space, normalize_images=self.normalize_images))
 
 
+class Head(nn.Linear):
+    """A last layer, which stays in float32 where the layers before it are in mixed precision."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: shape (B, F)
+        :return: shape (B, H)
+        """
+        if not th.is_autocast_enabled(x.device.type):
+            return super().forward(x)
+        with th.autocast(x.device.type, enabled=False):
+            return super().forward(x.float())
+
+
 class EnsembleLinear(nn.Module):
     """
     ``n_members`` linear layers in one batched product, each initialised like ``torch.nn.Linear``.
@@ -110,7 +124,7 @@ class EnsembleLinear(nn.Module):
         :param x: shape (N, B, F)
         :return: shape (N, B, H)
         """
-        return th.bmm(x, self.weight).add_(self.bias)
+        return th.bmm(x, self.weight) + self.bias
 
 
 class EnsembleInput(nn.Module):
@@ -139,7 +153,7 @@ class EnsembleInput(nn.Module):
         """
         n_members = len(self.bias)
         x = th.bmm(features.expand(n_members, *features.shape), self.features_weight)
-        return x.baddbmm_(actions.expand(n_members, *actions.shape), self.actions_weight).add_(self.bias)
+        return th.baddbmm(x, actions.expand(n_members, *actions.shape), self.actions_weight) + self.bias
 
 
 class EnsembleOutput(nn.Module):

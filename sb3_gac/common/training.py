@@ -60,6 +60,7 @@ class NetworkTraining(OffPolicyAlgorithm):
     target_update_interval: int
     max_grad_norm: float | None
     compile: bool
+    mixed_precision: bool
     programs: dict[Any, Program]
     program_key: tuple[Any, ...]
     _halves_are_independent: bool

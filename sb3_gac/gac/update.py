@@ -71,7 +71,9 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         (guider, next_guider), (learner, next_learner) = self._run_halves(
             [lambda: self._on_both("guider", batch), lambda: self._on_both("learner", batch)]
         )
-        return StepInputs(batch, guider, learner, (next_guider, next_learner), self.kl_coef_dual.value, self.ent_coef_dual.value)
+        return StepInputs(
+            batch, guider, learner, (next_guider, next_learner), self.kl_coef_dual.value, self.ent_coef_dual.value
+        )
 
     @compilable
     def _on_both(self, name: str, batch: Batch) -> tuple[ActorOutputs, ActorOutputs]:

@@ -1,0 +1,84 @@
+"""Compiled gradient steps do what plain ones do, notice what changes, and refuse what they can't do."""
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_gac import GAC, AsymmetricSAC
+from tests.helpers import TwoViewBandit, small_model
+
+
+def _filled(cls, **arguments):
+    return small_model(cls=cls, learning_starts=1000, **arguments).learn(64)
+
+
+def _train(models, gradient_steps=3, batch_size=16):
+    for model in models:
+        th.manual_seed(0)
+        np.random.seed(0)
+        model.train(gradient_steps, batch_size)
+
+
+def _assert_equal(model, other, **tolerance):
+    for (name, p), q in zip(model.policy.named_parameters(), other.policy.parameters(), strict=True):
+        th.testing.assert_close(p, q, **tolerance, msg=lambda text, name=name: f"{name}: {text}")
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+def test_compiled_training_is_plain_training(cls, tmp_path):
+    """Through other batch sizes and settings, new weights, a copy of the policy and a save: nothing stale is used."""
+    plain, compiled = _filled(cls), _filled(cls, compile=True)
+    _train((plain, compiled))
+    _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
+    assert compiled.logger.name_to_value["train/actor_loss"] == pytest.approx(
+        plain.logger.name_to_value["train/actor_loss"], rel=1e-4
+    )
+    n_programs = len(compiled.programs)
+    _train((plain, compiled))
+    assert len(compiled.programs) == n_programs > 0, "compiled once"
+    for model in (plain, compiled):
+        model.gamma = 0.5
+        with th.no_grad():
+            for p in model.policy.parameters():
+                p.add_(0.01)
+    _train((plain, compiled))
+    _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
+    compiled.save(tmp_path / "model")
+    loaded = cls.load(tmp_path / "model", env=TwoViewBandit())
+    loaded.set_logger(compiled.logger)
+    loaded.replay_buffer = compiled.replay_buffer
+    assert loaded.compile
+    _train((plain, loaded), batch_size=8)
+    _assert_equal(plain, loaded, rtol=1e-4, atol=1e-6)
+
+
+def test_a_setting_that_is_compiled_in_is_noticed():
+    plain, compiled = _filled(AsymmetricSAC), _filled(AsymmetricSAC, compile=True)
+    _train((plain, compiled))
+    for model in (plain, compiled):
+        model.max_grad_norm = 0.001
+    _train((plain, compiled))
+    _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
+    assert compiled.logger.name_to_value["train/actor_grad_norm"] > 0.001, "the bound did not matter"
+
+
+def test_what_draws_random_numbers_is_refused():
+    class Dropout(th.nn.Dropout):
+        """An activation that is none."""
+
+    with pytest.raises(ValueError, match="compile=True can't do dropout"):
+        small_model(compile=True, policy_kwargs={"net_arch": [8], "activation_fn": Dropout})
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+def test_mixed_precision_is_near_full_precision_and_keeps_parameters_and_heads_in_it(cls):
+    full, mixed = _filled(cls), _filled(cls, mixed_precision=True)
+    _train((full, mixed), gradient_steps=1, batch_size=64)
+    assert {p.dtype for p in mixed.policy.parameters()} == {th.float32}
+    for name in ("actor_loss", "critic_loss"):
+        values = [model.logger.name_to_value[f"train/{name}"] for model in (full, mixed)]
+        assert values[0] == pytest.approx(values[1], rel=0.02, abs=0.01)
+        assert values[0] != values[1], "nothing was in bfloat16"
+    with th.autocast("cpu", th.bfloat16):
+        batch = mixed._sample_batch(4).observations
+        assert {output.dtype for output in mixed.policy.deployed(batch)} == {th.float32}
