@@ -9,9 +9,10 @@ only spaces and sizes of the tasks, with random data; the rollout is that of Hal
 """
 
 import argparse
+import importlib.util
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,21 @@ from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.run import provenance
 
 SIZES = {"HalfCheetah": (8, 17, 6), "Ant": (13, 27, 8), "Humanoid": (169, 270, 17)}
-ALGORITHMS = {"gac": sb3_gac.GAC, "sac": SAC}
-BLOCK, ROUNDS = 20, 15
+COMPILED, MIXED = {"compile": True}, {"compile": True, "mixed_precision": True}
+CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {  # name -> class and arguments
+    "sac": (SAC, {}),
+    "gac": (sb3_gac.GAC, {}),
+    "gac-compiled": (sb3_gac.GAC, COMPILED),
+    "gac-mixed": (sb3_gac.GAC, MIXED),
+    "sac-asym": (sb3_gac.AsymmetricSAC, {}),
+    "sac-asym-compiled": (sb3_gac.AsymmetricSAC, COMPILED),
+}
+if importlib.util.find_spec("sbx"):
+    import sbx  # type: ignore[import-not-found]
+
+    CONTENDERS["sbx-sac"] = (sbx.SAC, {})
+GROWTH_CONTENDERS = ("sac", "gac", "gac-compiled")
+BLOCK, ROUNDS = 15, 9
 ENVS = (1, 8, 128)
 GROWTH = [  # batch, width, size of the privileged entry
     *((batch, 256, 17) for batch in (64, 256, 1024, 4096)),
@@ -65,30 +79,24 @@ class SpacesOnly(gym.Env):
         return self.observation_space.sample(), float(self.np_random.standard_normal()), False, False, {}
 
 
-def make_model(algorithm: Any, sizes: tuple[int, int, int], batch: int, width: int) -> Any:
+def make_step(contender: str, sizes: tuple[int, int, int], batch: int, width: int) -> Callable[[], None]:
     """
-    :param algorithm: GAC or SAC
+    :param contender: a key of ``CONTENDERS``
     :param sizes: partial, privileged, actions
     :param batch: batch size
     :param width: of the two hidden layers
-    :return: model with a buffer of random transitions
+    :return: one gradient step, as ``learn`` makes it, on a buffer of random transitions
     """
-    kwargs = {"net_arch": [width, width], "activation_fn": th.nn.SiLU}
-    settings = {"batch_size": batch, "learning_starts": 10**9, "buffer_size": 4_000, "seed": 0, "device": "cpu"}
-    model = algorithm("MultiInputPolicy", SpacesOnly(*sizes), policy_kwargs=kwargs, **settings)
+    algorithm, arguments = CONTENDERS[contender]
+    settings = {"batch_size": batch, "learning_starts": 10**9, "buffer_size": 4_000, "seed": 0, "device": "cpu"} | arguments
+    if algorithm.__module__.startswith("sbx"):  # knows no dicts
+        env: gym.Env = gym.wrappers.FlattenObservation(SpacesOnly(*sizes))
+        model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [width, width]}, **settings)
+    else:
+        kwargs = {"net_arch": [width, width], "activation_fn": th.nn.SiLU}
+        model = algorithm("MultiInputPolicy", SpacesOnly(*sizes), policy_kwargs=kwargs, **settings)
     model.set_logger(Logger(None, []))
-    return model.learn(2_000)
-
-
-def make_step(algorithm: str, sizes: tuple[int, int, int], batch: int, width: int) -> Callable[[], None]:
-    """
-    :param algorithm: a key of ``ALGORITHMS``
-    :param sizes: partial, privileged, actions
-    :param batch: batch size
-    :param width: of the two hidden layers
-    :return: one gradient step, as ``learn`` makes it
-    """
-    model = make_model(ALGORITHMS[algorithm], sizes, batch, width)
+    model.learn(2_000)
     return lambda: model.train(1, batch)
 
 
@@ -121,20 +129,23 @@ def matmul_rate(batch: int, width: int) -> float:
     return 2.0 * batch * width * width / float(np.median(seconds))
 
 
-def compare_steps(sizes: tuple[int, int, int], batch: int, width: int, threads: int, rounds: int) -> dict[str, float]:
+def compare_steps(
+    names: Iterable[str], sizes: tuple[int, int, int], batch: int, width: int, threads: int, rounds: int
+) -> dict[str, float]:
     """
-    :return: gradient steps per second of each algorithm, GAC's over SAC's, and GAC's share of the arithmetic's limit
+    :return: gradient steps per second of SB3's SAC, those of each contender as a multiple, and GAC's shares of the limit
     """
     repetitions = max(1, min(BLOCK, BLOCK * 256**3 // (batch * width**2)))
-    with process_timers(make_step, {name: (name, sizes, batch, width) for name in ALGORITHMS}, threads) as timers:
+    with process_timers(make_step, {name: (name, sizes, batch, width) for name in names}, threads) as timers:
         seconds = alternate(timers, repetitions, rounds)
     th.set_num_threads(threads)
     limit = matmul_rate(batch, width) / step_flops(sizes, batch, width)
-    rates = {name: 1 / float(np.median(values)) for name, values in seconds.items()}
+    others = [name for name in seconds if name != "sac"]
+    guided = [name for name in others if name.startswith("gac")]
     return {
-        **{f"{name}_per_second": round(rate, 1) for name, rate in rates.items()},
-        "gac_over_sac": round(median_ratio(seconds["sac"], seconds["gac"]), 3),
-        "gac_share_of_limit": round(rates["gac"] / limit, 3),
+        "sac_per_second": round(1 / float(np.median(seconds["sac"])), 1),
+        **{f"{name}_over_sac": round(median_ratio(seconds["sac"], seconds[name]), 3) for name in others},
+        **{f"{name}_share_of_limit": round(1 / float(np.median(seconds[name])) / limit, 3) for name in guided},
     }
 
 
@@ -239,12 +250,14 @@ def measure(threads: list[int], quick: bool) -> dict[str, Any]:
     rounds = 3 if quick else ROUNDS
     results: dict[str, Any] = {"steps": [], "growth": [], "rollout": [], "wrappers": [compare_wrappers(rounds)], "buffers": []}
     for count in threads:
-        for task, batch in [("HalfCheetah", 256)] if quick else [(task, batch) for task in SIZES for batch in (256, 512)]:
+        tasks = SIZES if count > 1 and not quick else ("HalfCheetah",)
+        for task, batch in [(task, batch) for task in tasks for batch in ((256,) if quick else (256, 512))]:
             row = {"task": task, "threads": count, "batch": batch, "width": 256}
-            results["steps"].append(row | compare_steps(SIZES[task], batch, 256, count, rounds))
+            results["steps"].append(row | compare_steps(CONTENDERS, SIZES[task], batch, 256, count, rounds))
     for batch, width, privileged in [] if quick else GROWTH:
         row = {"threads": threads[-1], "batch": batch, "width": width, "privileged": privileged}
-        results["growth"].append(row | compare_steps((8, privileged, 6), batch, width, threads[-1], rounds=5))
+        growth = compare_steps(GROWTH_CONTENDERS, (8, privileged, 6), batch, width, threads[-1], rounds=5)
+        results["growth"].append(row | growth)
     for n_envs in ENVS:
         vec_steps = max(4, (100 if quick else 1_000) // n_envs)
         results["rollout"].append({"envs": n_envs, "threads": threads[-1]} | profile_rollout(n_envs, vec_steps))
