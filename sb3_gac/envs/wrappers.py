@@ -71,7 +71,8 @@ class SplitObservation(_SplitWrapper):
         :return: ``partial`` and ``privileged``, float32
         """
         partial, privileged = self._selectors
-        return {PARTIAL: observation[partial].astype(np.float32), PRIVILEGED: observation[privileged].astype(np.float32)}
+        observation = observation.astype(np.float32)
+        return {PARTIAL: observation[partial], PRIVILEGED: observation[privileged].copy()}
 
 
 class SplitDictObservation(_SplitWrapper):
