@@ -73,6 +73,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--envs", type=int, default=4, help="environments side by side")
     parser.add_argument("--preset", default="small", help="arguments of GAC: small or paper")
+    parser.add_argument(
+        "--compile", action="store_true", help="faster gradient steps after half a minute; needs a C++ compiler"
+    )
     parser.add_argument("--episodes", type=int, default=10, help="of each evaluation")
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where results go")
     return parser.parse_args(arguments)
@@ -138,7 +141,7 @@ def train(options: argparse.Namespace) -> Path:
     env_id = f"sb3_gac/{options.task}-v5"
     env = make_vec_env(env_id, n_envs=options.envs, seed=options.seed, env_kwargs=env_kwargs)
     eval_env = make_vec_env(env_id, n_envs=min(5, options.episodes), env_kwargs=env_kwargs)
-    gac_arguments = preset(options.preset, buffer_size=min(1_000_000, max(options.steps, 1_000)))
+    gac_arguments = preset(options.preset, buffer_size=min(1_000_000, max(options.steps, 1_000)), compile=options.compile)
     if options.privileged != "state":
         gac_arguments["role_keys"] = None  # without the whole state in one entry, critics need all entries
     configuration = resolved_configuration(options, gac_arguments)
