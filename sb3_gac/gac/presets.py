@@ -11,6 +11,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "learning_rate": 1e-3,
         "learning_starts": 2_000,
         "batch_size": 128,
+        "tau": 0.01,
         "gradient_steps": -1,
         "role_keys": {"critic": ["privileged"]},
         "policy_kwargs": {"net_arch": [128, 128]},
