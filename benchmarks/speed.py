@@ -44,7 +44,7 @@ if importlib.util.find_spec("sbx"):
 
     CONTENDERS["sbx-sac"] = (sbx.SAC, {})
 GROWTH_CONTENDERS = ("sac", "gac", "gac-compiled")
-BLOCK, ROUNDS = 15, 9
+BLOCK, ROUNDS = 10, 9
 ENVS = (1, 8, 128)
 GROWTH = [  # batch, width, size of the privileged entry
     *((batch, 256, 17) for batch in (64, 256, 1024, 4096)),
@@ -251,12 +251,12 @@ def measure(threads: list[int], quick: bool) -> dict[str, Any]:
     results: dict[str, Any] = {"steps": [], "growth": [], "rollout": [], "wrappers": [compare_wrappers(rounds)], "buffers": []}
     for count in threads:
         tasks = SIZES if count > 1 and not quick else ("HalfCheetah",)
-        for task, batch in [(task, batch) for task in tasks for batch in ((256,) if quick else (256, 512))]:
+        for task, batch in [(task, batch) for task in tasks for batch in ((256, 512) if tasks is SIZES else (256,))]:
             row = {"task": task, "threads": count, "batch": batch, "width": 256}
             results["steps"].append(row | compare_steps(CONTENDERS, SIZES[task], batch, 256, count, rounds))
     for batch, width, privileged in [] if quick else GROWTH:
         row = {"threads": threads[-1], "batch": batch, "width": width, "privileged": privileged}
-        growth = compare_steps(GROWTH_CONTENDERS, (8, privileged, 6), batch, width, threads[-1], rounds=5)
+        growth = compare_steps(GROWTH_CONTENDERS, (8, privileged, 6), batch, width, threads[-1], rounds=3)
         results["growth"].append(row | growth)
     for n_envs in ENVS:
         vec_steps = max(4, (100 if quick else 1_000) // n_envs)
