@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -55,6 +55,8 @@ class NetworkTraining(OffPolicyAlgorithm):
     The attributes below are those of :class:`sb3_gac.common.off_policy.AsymmetricOffPolicyAlgorithm`.
     """
 
+    #: Arguments that a compiled part takes for constants: a change compiles it anew
+    compiled_settings: ClassVar[tuple[str, ...]] = ("max_grad_norm", "mixed_precision")
     policy: AsymmetricPolicy
     tau: float
     target_update_interval: int
@@ -74,15 +76,11 @@ class NetworkTraining(OffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self.policy.refresh_parameters()
         self._update_learning_rate(self._scheduled_optimizers())
-        self.program_key = (batch_size, self.policy, *self._settings())
+        self.program_key = (batch_size, self.policy, *(getattr(self, name) for name in self.compiled_settings))
         self._halves_together = self._halves_are_independent and th.get_num_threads() > 1
         with halved_threads(self._halves_together):
             history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
         self._record_metrics(history)
-
-    def _settings(self) -> list[bool | float | str]:
-        """Arguments that a compiled gradient step may have taken for constants."""
-        return [value for name, value in vars(self).items() if name[0] != "_" and isinstance(value, (bool, float, str))]
 
     def _one_update(self, batch_size: int, diagnose: bool) -> Metrics:
         metrics = self._gradient_step(self._sample_batch(batch_size), diagnose)

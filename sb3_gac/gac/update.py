@@ -42,6 +42,12 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     The attributes below are set by :class:`sb3_gac.GAC`, where they are described.
     """
 
+    compiled_settings = (
+        *AsymmetricOffPolicyAlgorithm.compiled_settings,
+        "kl_reduction",
+        "learner_kl_scale",
+        "learner_entropy",
+    )
     policy: GACPolicy
     kl_coef_dual: Coefficient
     kl_reduction: str

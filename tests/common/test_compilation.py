@@ -52,14 +52,18 @@ def test_compiled_training_is_plain_training(cls, tmp_path):
     _assert_equal(plain, loaded, rtol=1e-4, atol=1e-6)
 
 
-def test_a_setting_that_is_compiled_in_is_noticed():
-    plain, compiled = _filled(AsymmetricSAC), _filled(AsymmetricSAC, compile=True)
-    _train((plain, compiled))
+@pytest.mark.parametrize(
+    ("cls", "setting", "value"), [(AsymmetricSAC, "max_grad_norm", 0.001), (GAC, "learner_kl_scale", 100.0)]
+)
+def test_a_setting_that_is_compiled_in_is_noticed(cls, setting, value):
+    plain, compiled, unchanged = _filled(cls), _filled(cls, compile=True), _filled(cls)
+    _train((plain, compiled, unchanged))
     for model in (plain, compiled):
-        model.max_grad_norm = 0.001
-    _train((plain, compiled))
+        setattr(model, setting, value)
+    _train((plain, compiled, unchanged))
     _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
-    assert compiled.logger.name_to_value["train/actor_grad_norm"] > 0.001, "the bound did not matter"
+    with pytest.raises(AssertionError):  # or the setting did not matter
+        _assert_equal(plain, unchanged, rtol=1e-4, atol=1e-6)
 
 
 def test_what_draws_random_numbers_is_refused():
