@@ -47,8 +47,8 @@ GROWTH_CONTENDERS = ("sac", "gac", "gac-compiled")
 BLOCK, ROUNDS = 10, 9
 ENVS = (1, 8, 128)
 GROWTH = [  # batch, width, size of the privileged entry
-    *((batch, 256, 17) for batch in (64, 256, 1024, 4096)),
-    *((256, width, 17) for width in (64, 128, 512, 1024)),
+    *((batch, 256, 17) for batch in (64, 1024, 4096)),
+    *((256, width, 17) for width in (64, 512, 1024)),
     *((256, 256, privileged) for privileged in (9, 376, 1508)),
 ]
 
