@@ -42,9 +42,11 @@ def process_timers(
     """
     context = multiprocessing.get_context("spawn")
     connections: dict[str, Connection] = {}
+    processes = []
     for name, values in arguments.items():
         connections[name], theirs = context.Pipe()
-        context.Process(target=_serve, args=(theirs, make, values, threads), daemon=True).start()
+        processes.append(context.Process(target=_serve, args=(theirs, make, values, threads), daemon=True))
+        processes[-1].start()
         theirs.close()
 
     def remote(connection: Connection) -> Timer:
@@ -61,6 +63,8 @@ def process_timers(
     finally:
         for connection in connections.values():
             connection.close()  # ends its process
+        for process in processes:
+            process.join()  # what is timed next has the machine to itself
 
 
 def _serve(connection: Connection, make: Callable[..., Callable[[], Any]], arguments: tuple, threads: int) -> None:
