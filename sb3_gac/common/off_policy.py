@@ -58,8 +58,8 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
     :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
     :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
-        "critic" stands for all critics, which learn far better without sensor noise among their inputs: where
-        ``privileged`` is the whole state, give them ``{"critic": ["privileged"]}``
+        "critic" stands for all critics: where ``privileged`` is the whole state, spare them the sensor noise with
+        ``{"critic": ["privileged"]}``
     :param compile: compile losses and gradients: half a minute at the start (less the next time, from a cache), faster
         gradient steps from then on; needs a C++ compiler on the CPU
     :param mixed_precision: matrix products of losses and gradients in bfloat16, which pays at 256 units and more on
