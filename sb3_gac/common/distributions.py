@@ -34,15 +34,13 @@ class TanhGaussian(NamedTuple):
         """Reparameterised action in [-1, 1], shape (\\*E, A)."""
         return th.tanh(self._pre_tanh(th.randn_like(self.mean)))
 
-    def sample_with_log_prob(self, noise: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
+    def sample_with_log_prob(self, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Reparameterised action and its log-probability.
 
-        :param noise: standard normal, shape (\\*E, A); drawn here if ``None``
+        :param noise: standard normal, shape (\\*E, A)
         :return: action in [-1, 1], shape (\\*E, A), and log-probability, shape (\\*E)
         """
-        if noise is None:
-            noise = th.randn_like(self.mean)
         pre_tanh = self._pre_tanh(noise)
         return th.tanh(pre_tanh), self._log_prob(pre_tanh, noise)
 

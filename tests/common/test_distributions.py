@@ -24,7 +24,7 @@ def test_log_prob(dtype):
 def test_sampled_log_prob_is_that_of_the_sampled_action():
     th.manual_seed(0)
     distribution = TanhGaussian(th.zeros(1000, 2, dtype=th.float64), th.full((1000, 2), -0.5, dtype=th.float64))
-    action, log_prob = distribution.sample_with_log_prob()
+    action, log_prob = distribution.sample_with_log_prob(th.randn_like(distribution.mean))
     th.testing.assert_close(log_prob, distribution.log_prob(th.atanh(action)))
 
 
