@@ -3,7 +3,8 @@ Finished runs of a suite -> a tidy CSV, and scores as JSON::
 
     python -m benchmarks.aggregate benchmarks/suites/halfcheetah.yml --out benchmarks/results/halfcheetah
 
-A missing run is an error, not a smaller average.  Intervals are stratified bootstraps of 95% (rliable, arXiv 2108.13264).
+A missing run is an error, not a smaller average; ``--complete-cells`` leaves out the suite's cells of which a run is missing,
+all of their runs, and names them in the results.  Intervals are stratified bootstraps of 95% (rliable, arXiv 2108.13264).
 """
 
 import argparse
@@ -18,29 +19,40 @@ import yaml
 from rliable import library as rly
 from rliable import metrics
 
-from benchmarks.suite import HERE, RunSpec, read_suite
+from benchmarks.suite import HERE, RunSpec, read_cells
 
 CELL = ["task", "noise"]
 STEADY_FROM = 5_000
 BOOTSTRAPS = 2_000
 
 
-def collect(suite: Path, runs: Path) -> pd.DataFrame:
+def finished_runs(suite: Path, runs: Path, complete_cells: bool = False) -> tuple[list[RunSpec], list[str]]:
     """
     :param suite: YAML file
     :param runs: directory of all runs
-    :return: one row per evaluation: task, noise, algorithm, seed, timesteps, learner, and guider, kl, ... where there are
+    :param complete_cells: whether a cell of which a run is missing is left out, instead of an error
+    :return: the runs to count, and the directories of those that are missing
     :raises FileNotFoundError: naming the runs that are not finished
+    :raises ValueError: if a run was made with other settings
     """
-    specs = read_suite(suite)
-    paths = [spec.directory(runs) / "evaluations.csv" for spec in specs]
-    missing = [str(path.parent) for path in paths if not path.exists()]
-    if missing:
+    cells = read_cells(suite)
+    complete = [cell for cell in cells if all(spec.is_finished(runs) for spec in cell)]
+    missing = [str(spec.directory(runs)) for cell in cells for spec in cell if not spec.is_finished(runs)]
+    if missing and not (complete_cells and complete):
         raise FileNotFoundError(f"{len(missing)} runs are not finished: {missing}")
+    return [spec for cell in complete for spec in cell], missing
+
+
+def collect(specs: list[RunSpec], runs: Path) -> pd.DataFrame:
+    """
+    :param specs: of finished runs
+    :param runs: directory of all runs
+    :return: one row per evaluation: task, noise, algorithm, seed, timesteps, learner, and guider, kl, ... where there are
+    """
     frames = []
-    for spec, path in zip(specs, paths, strict=True):
+    for spec in specs:
         columns = {"task": spec.task, "noise": spec.noise, "algorithm": spec.algorithm, "seed": spec.seed}
-        frames.append(pd.read_csv(path).assign(**columns))
+        frames.append(pd.read_csv(spec.directory(runs) / "evaluations.csv").assign(**columns))
     tidy = pd.concat(frames, ignore_index=True)
     first = [*CELL, "algorithm", "seed"]
     return tidy[[*first, *(column for column in tidy.columns if column not in first)]]
@@ -157,9 +169,8 @@ def _rounded(estimates: dict[str, tuple[float, tuple[float, float]]]) -> dict[st
     return {name: [round(value, 3) for value in (point, low, high)] for name, (point, (low, high)) in estimates.items()}
 
 
-def origins(suite: Path, runs: Path) -> dict[str, Any]:
-    """Command, commits and versions of the runs, their arguments, and the hours that they took."""
-    specs = read_suite(suite)
+def origins(suite: Path, specs: list[RunSpec], runs: Path) -> dict[str, Any]:
+    """Command, commits and versions of the runs, their arguments and directories, and the hours that they took."""
     configurations = [yaml.safe_load((spec.directory(runs) / "config.yaml").read_text()) for spec in specs]
     seconds = [json.loads((spec.directory(runs) / "timing.json").read_text())["seconds"] for spec in specs]
     return {
@@ -170,6 +181,7 @@ def origins(suite: Path, runs: Path) -> dict[str, Any]:
         "hours": round(sum(seconds) / 3600, 2),
         "seconds_per_run": {"median": round(float(np.median(seconds)), 1), "max": round(max(seconds), 1)},
         "arguments": _arguments_by_algorithm(specs, configurations),
+        "directories": [str(spec.directory(Path())) for spec in specs],
     }
 
 
@@ -187,9 +199,16 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=HERE / "runs")
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
     parser.add_argument("--reference", default="sac-asym", help="algorithm to whose final return steps are counted")
+    parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
     options = parser.parse_args()
-    tidy = collect(options.suite, options.runs)
-    results = {**origins(options.suite, options.runs), "cells": summarise_cells(tidy, options.reference), **compare(tidy)}
+    specs, missing = finished_runs(options.suite, options.runs, options.complete_cells)
+    tidy = collect(specs, options.runs)
+    results = {
+        **origins(options.suite, specs, options.runs),
+        "still_to_run": [str(Path(directory).relative_to(options.runs)) for directory in missing],
+        "cells": summarise_cells(tidy, options.reference),
+        **compare(tidy),
+    }
     options.out.parent.mkdir(parents=True, exist_ok=True)
     tidy.round(5).to_csv(options.out.with_suffix(".csv"), index=False)
     options.out.with_suffix(".json").write_text(json.dumps(results, indent=1))

@@ -4,14 +4,13 @@ A suite -> its runs, several side by side with one thread each::
     python -m benchmarks.launch benchmarks/suites/halfcheetah.yml --jobs 2
 
 Finished runs are skipped and unfinished ones go on from their checkpoints, so an interrupted launch is resumed by the same
-command.  A failed run is tried again.  ``--dry-run`` prints the commands of what is left to do.
+command.  A failed run is tried again.  ``--dry-run`` prints the commands of what is left to do.  ``--engine ray`` runs on a
+Ray cluster whose nodes share this checkout, its Python and the runs' directory.
 """
 
 import argparse
 import json
-import os
 import shlex
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from benchmarks.engines import Engine, LocalEngine, RayEngine
 from benchmarks.suite import HERE, RunSpec, read_suite
 
 
@@ -53,7 +53,7 @@ def jobs_left(suite: Path, runs: Path) -> tuple[list[Job], int]:
     :return: the runs that are not finished, and how many are
     """
     specs = read_suite(suite)
-    left = [(index, spec) for index, spec in enumerate(specs) if not (spec.directory(runs) / "evaluations.csv").exists()]
+    left = [(index, spec) for index, spec in enumerate(specs) if not spec.is_finished(runs)]
     jobs = [Job(spec, spec.directory(runs), run_command(suite, index, runs)) for index, spec in left]
     return jobs, len(specs) - len(left)
 
@@ -63,25 +63,16 @@ def run_command(suite: Path, index: int, runs: Path) -> list[str]:
     return [sys.executable, "-m", "benchmarks.run", "--suite", str(suite), "--index", str(index), "--runs", str(runs)]
 
 
-def launch_one(job: Job, retries: int) -> None:
+def launch_one(job: Job, retries: int, engine: Engine) -> None:
     """
     :param job: to run in a process of its own with one thread; its state says how it ended
     :param retries: further attempts after one that failed
+    :param engine: where
     """
     job.directory.mkdir(parents=True, exist_ok=True)
     job.state = "running"
-    for attempt in range(retries + 1):
-        with job.log.open("a") as log:
-            log.write(f"--- attempt {attempt + 1}: {shlex.join(job.command)}\n")
-            log.flush()
-            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-            status = subprocess.run(
-                job.command, stdout=log, stderr=subprocess.STDOUT, env=environment, cwd=HERE.parent, check=False
-            )
-        if status.returncode == 0:
-            job.state = "finished"
-            return
-    job.state = "failed"
+    done = any(engine.run(job.command, job.log) == 0 for _ in range(retries + 1))
+    job.state = "finished" if done else "failed"
 
 
 def progress(job: Job) -> tuple[str, str]:
@@ -109,15 +100,16 @@ def table(jobs: list[Job]) -> Table:
     return result
 
 
-def launch(jobs: list[Job], at_once: int, retries: int) -> None:
+def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine) -> None:
     """
     :param jobs: to run
     :param at_once: how many side by side
     :param retries: further attempts after one that failed
+    :param engine: where
     """
     console = Console()
     with ThreadPoolExecutor(at_once) as pool:
-        futures = [pool.submit(launch_one, job, retries) for job in jobs]
+        futures = [pool.submit(launch_one, job, retries, engine) for job in jobs]
         with Live(
             get_renderable=lambda: table(jobs), console=console, refresh_per_second=1, transient=not console.is_terminal
         ):
@@ -129,7 +121,9 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suite", type=Path)
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs side by side")
+    parser.add_argument("--engine", choices=["local", "ray"], default="local")
+    parser.add_argument("--address", default="auto", help="of the Ray cluster")
+    parser.add_argument("--jobs", type=int, help="runs side by side; default: one on each CPU")
     parser.add_argument("--retries", type=int, default=1, help="further attempts after a run that failed")
     parser.add_argument("--runs", type=Path, default=HERE / "runs")
     parser.add_argument("--dry-run", action="store_true", help="print the commands of what is left to do")
@@ -138,7 +132,8 @@ def main() -> None:
     if options.dry_run:
         print("\n".join(shlex.join(job.command) for job in jobs))
         return
-    launch(jobs, options.jobs, options.retries)
+    engine = LocalEngine() if options.engine == "local" else RayEngine(options.address)
+    launch(jobs, options.jobs or engine.cpus, options.retries, engine)
     failed = [job for job in jobs if job.state == "failed"]
     for job in failed:
         print(f"{job.directory}: FAILED, see {job.log}")

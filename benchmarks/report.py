@@ -9,6 +9,7 @@ reads ``halfcheetah.csv`` and ``halfcheetah.json`` and writes ``.png`` and ``.ht
 import argparse
 import html
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ import numpy as np
 import pandas as pd
 from plotly import graph_objects
 from plotly.subplots import make_subplots
+
+from benchmarks.suite import HERE
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -111,7 +114,9 @@ def interactive(tidy: pd.DataFrame) -> graph_objects.Figure:
                         graph_objects.Scatter(x=mean.index, y=mean, name=algorithm, showlegend=first, **common), row, column
                     )
                     named.add(algorithm)
-    figure.update_layout(height=340 * len(noises) + 80, hovermode="closest", template="plotly_white")
+    figure.update_layout(
+        height=340 * len(noises) + 80, hovermode="closest", hoverlabel={"namelength": -1}, template="plotly_white"
+    )
     return figure
 
 
@@ -159,21 +164,28 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def page(tidy: pd.DataFrame, results: dict[str, Any], title: str) -> str:
+def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> str:
     """
     :param tidy: as aggregated
     :param results: as aggregated
     :param title: of the page
+    :param runs: directory of all runs, as seen from the page: where its links to logs go
     :return: HTML that needs nothing else
     """
     tables = "".join(_html_table(table) for table in (cells_table(results["cells"]), overall_table(results)))
     plot = interactive(tidy).to_html(full_html=False, include_plotlyjs=True)
-    origin = {key: results[key] for key in ("command", "commits", "versions", "hours", "arguments")}
+    origin = {key: results[key] for key in ("command", "commits", "versions", "hours", "still_to_run", "arguments")}
+    logs = "".join(f"<li>{_link(f'{runs}/{directory}', directory)}</li>" for directory in results["directories"])
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}</style>'
         f"</head><body><h1>{html.escape(title)}</h1>{plot}{tables}<h2>Configuration and versions</h2>"
-        f"<pre>{html.escape(json.dumps(origin, indent=1))}</pre></body></html>"
+        f"<pre>{html.escape(json.dumps(origin, indent=1))}</pre><h2>Runs</h2><p>Each with log.txt, its TensorBoard log, "
+        f"configuration and model, on the machine that made this page.</p><ul>{logs}</ul></body></html>"
     )
+
+
+def _link(target: str, text: str) -> str:
+    return f'<a href="{html.escape(target, quote=True)}">{html.escape(text)}</a>'
 
 
 def _html_table(table: str) -> str:
@@ -189,11 +201,13 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, help="path of the results, without a suffix")
+    parser.add_argument("--runs", type=Path, default=HERE / "runs", help="what the page's links to logs point at")
     options = parser.parse_args()
     tidy = pd.read_csv(options.results.with_suffix(".csv"))
     results = json.loads(options.results.with_suffix(".json").read_text())
     draw(tidy, options.results.with_suffix(".png"))
-    options.results.with_suffix(".html").write_text(page(tidy, results, options.results.stem))
+    runs = os.path.relpath(options.runs, options.results.parent)
+    options.results.with_suffix(".html").write_text(page(tidy, results, options.results.stem, runs))
     print(f"{cells_table(results['cells'])}\n\n{overall_table(results)}")
 
 

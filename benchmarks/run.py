@@ -55,10 +55,10 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     :param progress_bar: whether to show one
     :return: the run's directory
     :raises RuntimeError: if another process is running it
-    :raises ValueError: if its directory holds an unfinished run with another configuration
+    :raises ValueError: if its directory holds a run with another configuration
     """
     directory = spec.directory(root)
-    if (directory / "evaluations.csv").exists():
+    if spec.is_finished(root):
         return directory
     directory.mkdir(parents=True, exist_ok=True)
     with locked(directory):

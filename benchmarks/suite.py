@@ -1,7 +1,8 @@
 """A suite: which algorithms, on which tasks, at which noise levels, with which seeds. Read from YAML, checked by name."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,22 @@ class RunSpec:
 
     def directory(self, root: Path) -> Path:
         """Where this run's files go."""
-        return root / f"{self.task}-noise{self.noise:g}" / self.algorithm / f"seed{self.seed}"
+        return root / f"{self.preset}-{self.steps}" / f"{self.task}-noise{self.noise:g}" / self.algorithm / f"seed{self.seed}"
+
+    def is_finished(self, root: Path) -> bool:
+        """
+        :param root: directory of all runs
+        :return: whether this run is there, from its start to its end
+        :raises ValueError: if what is there is a run with other settings
+        """
+        directory = self.directory(root)
+        if not (directory / "evaluations.csv").exists():
+            return False
+        there = yaml.safe_load((directory / "config.yaml").read_text())["run"]
+        changed = sorted(key for key, value in asdict(self).items() if there.get(key) != value)
+        if changed:
+            raise ValueError(f"{directory} holds a run with other settings under {changed}: remove it, or use another --runs.")
+        return True
 
 
 def read_suite(path: Path) -> list[RunSpec]:
@@ -52,21 +68,33 @@ def read_suite(path: Path) -> list[RunSpec]:
     :return: its runs; all seeds of a cell before the next cell
     :raises ValueError: if a key is unknown or missing
     """
+    return [spec for cell in read_cells(path) for spec in cell]
+
+
+def read_cells(path: Path) -> list[list[RunSpec]]:
+    """
+    :param path: YAML file
+    :return: its runs, by entry of its ``cells`` and noise
+    :raises ValueError: if a key is unknown or missing, or a run is listed twice
+    """
     suite = yaml.safe_load(path.read_text())
     if "preset" in suite:
         suite = {**read_preset(suite["preset"])["run"], **suite}
     check_keys(path.name, suite, _SUITE_KEYS, _SUITE_KEYS - {"overrides"})
-    return [spec for cell in suite["cells"] for spec in _cell_runs(path.name, suite, cell)]
+    cells = [runs for cell in suite["cells"] for runs in _cells_by_noise(path.name, suite, cell)]
+    count = Counter(str(spec.directory(Path())) for cell in cells for spec in cell)
+    if twice := sorted(directory for directory, times in count.items() if times > 1):
+        raise ValueError(f"{path.name} lists these runs more than once: {twice}.")
+    return cells
 
 
-def _cell_runs(name: str, suite: dict[str, Any], cell: dict[str, Any]) -> Iterator[RunSpec]:
+def _cells_by_noise(name: str, suite: dict[str, Any], cell: dict[str, Any]) -> Iterator[list[RunSpec]]:
     check_keys(f"{name}, a cell", cell, _CELL_KEYS, _CELL_KEYS)
     common = {key: suite[key] for key in ("steps", "envs", "preset", "eval_every", "eval_episodes")}
+    common["overrides"] = suite.get("overrides", {})
     for noise in cell["noises"]:
-        for seed in cell["seeds"]:
-            for algorithm in cell["algorithms"]:
-                overrides = suite.get("overrides", {})
-                yield RunSpec(algorithm, cell["task"], float(noise), seed, overrides=overrides, **common)
+        runs = ((algorithm, seed) for seed in cell["seeds"] for algorithm in cell["algorithms"])
+        yield [RunSpec(algorithm, cell["task"], float(noise), seed, **common) for algorithm, seed in runs]
 
 
 def read_preset(name: str) -> dict[str, Any]:

@@ -17,9 +17,10 @@ import torch as th
 import yaml
 
 import benchmarks.run
-from benchmarks.aggregate import collect, compare, summarise_cells
+from benchmarks.aggregate import compare, finished_runs, summarise_cells
 from benchmarks.checkpoint import locked
 from benchmarks.config import instantiate, read_algorithm, resolve
+from benchmarks.launch import jobs_left
 from benchmarks.run import run
 from benchmarks.suite import RunSpec, read_preset, read_suite
 from sb3_gac import GAC, preset
@@ -90,9 +91,21 @@ def test_results_are_aggregated_and_reported(runs, tmp_path):
     assert not re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="http', page), "nothing is loaded from elsewhere"
 
 
-def test_a_missing_run_is_an_error(runs, tmp_path):
+def test_a_missing_run_is_an_error_or_leaves_its_whole_cell_out(runs, tmp_path):
     with pytest.raises(FileNotFoundError, match="4 runs are not finished"):
-        collect(SMOKE, tmp_path)
+        finished_runs(SMOKE, tmp_path)
+    suite = yaml.safe_load(SMOKE.read_text())
+    suite["cells"].append({**suite["cells"][0], "noises": [0.1, 0.2], "seeds": [2, 3]})
+    path = tmp_path / "grown.yml"
+    path.write_text(yaml.safe_dump(suite))
+    with pytest.raises(FileNotFoundError, match="8 runs are not finished"):
+        finished_runs(path, runs)
+    result = _program("benchmarks.aggregate", path, "--runs", runs, "--out", tmp_path / "grown", "--complete-cells")
+    assert result.returncode == 0, result.stderr
+    record = json.loads((tmp_path / "grown.json").read_text())
+    assert len(record["still_to_run"]) == 8
+    assert "small-600/InvertedDoublePendulum-noise0.2/gac/seed2" in record["still_to_run"]
+    assert [cell["seeds"] for cell in record["cells"]] == [[0, 1], [0, 1]]
 
 
 def _evaluations(algorithm, seed, learner, task="T", guider=None):
@@ -147,7 +160,7 @@ def test_a_failing_run_is_named_with_its_log(tmp_path):
     path.write_text(yaml.safe_dump(suite))
     result = _program("benchmarks.launch", path, "--runs", tmp_path, "--retries", 1)
     assert result.returncode == 1
-    log = tmp_path / "NoSuchTask-noise0.1" / "gac" / "seed0" / "log.txt"
+    log = tmp_path / "small-600" / "NoSuchTask-noise0.1" / "gac" / "seed0" / "log.txt"
     assert f"FAILED, see {log}" in result.stdout.replace("\n", "")
     assert "NoSuchTask" in log.read_text()
     assert log.read_text().count("--- attempt") == 2
@@ -163,6 +176,15 @@ def test_unknown_and_missing_keys_are_refused(tmp_path, change, message):
     path = tmp_path / "suite.yml"
     path.write_text(yaml.safe_dump(suite))
     with pytest.raises(ValueError, match=message):
+        read_suite(path)
+
+
+def test_a_run_listed_twice_is_refused(tmp_path):
+    suite = yaml.safe_load(SMOKE.read_text())
+    suite["cells"].append({**suite["cells"][0], "seeds": [1, 2]})
+    path = tmp_path / "suite.yml"
+    path.write_text(yaml.safe_dump(suite))
+    with pytest.raises(ValueError, match=r"more than once: \['small-600/InvertedDoublePendulum-noise0.1/gac/seed1', "):
         read_suite(path)
 
 
@@ -202,11 +224,11 @@ def test_the_papers_preset_has_the_papers_values(task, noise, target_kl):
 
 
 def test_every_algorithm_fits_every_preset():
-    algorithms = yaml.safe_load((ROOT / "benchmarks/hyperparams/algorithms.yml").read_text())
+    algorithms = set(yaml.safe_load((ROOT / "benchmarks/hyperparams/algorithms.yml").read_text()))
     presets = [path.stem for path in (ROOT / "benchmarks/hyperparams/presets").glob("*.yml")]
     assert len(presets) >= 3
     for preset_name in presets:
-        for algorithm in algorithms:
+        for algorithm in algorithms if preset_name == "sb3" else algorithms - {"sb3-sac"}:
             algorithm_class, arguments = resolve(RunSpec(algorithm, "Ant", 0.1, 0, 1000, 4, preset_name, 500, 1))
             env = gym.make("sb3_gac/InvertedDoublePendulum-v5")
             algorithm_class("MultiInputPolicy", env, **{**instantiate(arguments), "buffer_size": 1_000, "device": "cpu"})
@@ -284,9 +306,15 @@ def test_two_runs_are_never_mixed(tmp_path):
         run(spec, tmp_path)
 
 
-def test_run_leaves_a_finished_directory_alone(tmp_path):
+def test_a_finished_run_with_other_settings_is_neither_skipped_nor_counted(tmp_path):
     spec = read_suite(SMOKE)[0]
-    spec.directory(tmp_path).mkdir(parents=True)
-    (spec.directory(tmp_path) / "evaluations.csv").write_text("done")
-    run(spec, tmp_path)
-    assert (spec.directory(tmp_path) / "evaluations.csv").read_text() == "done"
+    directory = spec.directory(tmp_path)
+    directory.mkdir(parents=True)
+    (directory / "evaluations.csv").write_text("done")
+    (directory / "config.yaml").write_text(yaml.safe_dump({"run": asdict(spec)}))
+    assert run(spec, tmp_path) == directory
+    assert (directory / "evaluations.csv").read_text() == "done", "left alone"
+    (directory / "config.yaml").write_text(yaml.safe_dump({"run": {**asdict(spec), "eval_episodes": 7}}))
+    for program in (lambda: run(spec, tmp_path), lambda: jobs_left(SMOKE, tmp_path), lambda: finished_runs(SMOKE, tmp_path)):
+        with pytest.raises(ValueError, match=r"other settings under \['eval_episodes'\]: remove it, or use another --runs"):
+            program()
