@@ -1,9 +1,8 @@
 """The benchmark programs, run as a user runs them, on a suite of seconds."""
 
 import json
-import os
 import re
-import signal
+import shutil
 import subprocess
 import sys
 from dataclasses import asdict, replace
@@ -239,34 +238,49 @@ def test_the_librarys_small_preset_is_the_benchmarks():
     assert {**preset("small"), "buffer_size": 1000} == arguments
 
 
+KILLS = 10  # of each program
+
+
 @pytest.mark.parametrize("program", ["benchmarks.run", "benchmarks.launch"])
 def test_what_is_killed_at_any_moment_is_finished_by_the_same_command(runs, tmp_path, program):
-    """kill -9 after moments that fall before, between and after checkpoints; in the end the same list of finished runs."""
+    """kill -9 before, between and after checkpoints; what is there stays readable, and in the end all runs are finished."""
     specs = read_suite(SMOKE)[:1] if program == "benchmarks.run" else read_suite(SMOKE)
     arguments = ["--suite", SMOKE, "--index", 0] if program == "benchmarks.run" else [SMOKE, "--jobs", 2]
     command = [sys.executable, "-m", program, *map(str, arguments), "--runs", str(tmp_path)]
-    moments = np.random.default_rng(0).uniform(4.0, 9.0, size=3)
-    for moment in moments:
-        process = subprocess.Popen(
-            command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-        )
+    generator, kills = np.random.default_rng(0), 0
+    while kills < KILLS:
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
-            process.wait(moment)
+            assert process.wait(generator.uniform(3.0, 10.0)) == 0
+            _assert_finished_as(specs, tmp_path, runs)
+            shutil.rmtree(tmp_path / "small-600")  # and from the start again
         except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
+            process.kill()
             process.wait()
-        for spec in specs:
-            history = spec.directory(tmp_path) / "checkpoint" / "history.json"
-            if history.exists():
-                json.loads(history.read_text())
+            kills += 1
+            _assert_readable(tmp_path)
     assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
+    _assert_finished_as(specs, tmp_path, runs)
+
+
+def _assert_readable(directory):
+    for path in directory.rglob("*.json"):
+        json.loads(path.read_text())
+    for path in directory.rglob("config.yaml"):
+        assert "run" in yaml.safe_load(path.read_text())
+    for path in directory.rglob("evaluations.csv"):
+        assert pd.read_csv(path).timesteps.tolist() == [200, 400, 600]
+
+
+def _assert_finished_as(specs, directory, undisturbed):
+    _assert_readable(directory)
     for spec in specs:
-        evaluations = pd.read_csv(spec.directory(tmp_path) / "evaluations.csv")
-        assert evaluations.timesteps.tolist() == [200, 400, 600]
-        read_algorithm(spec.algorithm)[0].load(spec.directory(tmp_path) / "model")
-        assert {path.name for path in spec.directory(tmp_path).iterdir()} - {"log.txt"} == {
-            path.name for path in spec.directory(runs).iterdir()
-        } - {"log.txt"}
+        assert spec.is_finished(directory)
+        read_algorithm(spec.algorithm)[0].load(spec.directory(directory) / "model")
+        files, expected = (
+            {path.name for path in spec.directory(root).iterdir()} - {"log.txt"} for root in (directory, undisturbed)
+        )
+        assert files == expected
 
 
 def test_a_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch):

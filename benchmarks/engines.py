@@ -1,0 +1,79 @@
+"""Where a run's process is started: on this machine, or on some node of a Ray cluster that shares the runs' directory."""
+
+import ctypes
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from benchmarks.suite import HERE
+
+NODE_LOSSES = 10
+_PR_SET_PDEATHSIG = 1
+_prctl: Any = ctypes.CDLL(None).prctl if sys.platform == "linux" else None  # elsewhere runs outlive a killed launch
+
+
+def run_process(command: list[str], log: Path) -> int:
+    """
+    A process with one thread, which ends with the one that started it: a lost node leaves no half-run behind.
+
+    :param command: to run
+    :param log: where its output is added
+    :return: exit status
+    """
+    with log.open("a") as file:
+        file.write(f"--- attempt: {shlex.join(command)}\n")
+        file.flush()
+        return subprocess.run(
+            command,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            cwd=HERE.parent,
+            preexec_fn=_end_with_parent if _prctl else None,
+            check=False,
+        ).returncode
+
+
+def _end_with_parent() -> None:
+    _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+class LocalEngine:
+    """This machine."""
+
+    cpus = os.cpu_count() or 1
+
+    def run(self, command: list[str], log: Path) -> int:
+        """See :func:`run_process`."""
+        return run_process(command, log)
+
+
+class RayEngine:
+    """
+    A Ray cluster. A run whose node is lost starts again on another one, from its last checkpoint.
+
+    :param address: of the cluster, "auto" for the one that this machine belongs to
+    :raises ImportError: if Ray is not installed
+    """
+
+    def __init__(self, address: str):
+        try:
+            import ray
+        except ImportError:
+            raise ImportError('--engine ray needs Ray: pip install "sb3_gac[ray]".') from None
+        environment = {"env_vars": {"PYTHONPATH": str(HERE.parent)}}
+        ray.init(address, log_to_driver=False, runtime_env=environment, ignore_reinit_error=True)
+        self._ray = ray
+        self._run = ray.remote(num_cpus=1, max_retries=NODE_LOSSES)(run_process)
+        self.cpus = int(ray.cluster_resources().get("CPU", 1))
+
+    def run(self, command: list[str], log: Path) -> int:
+        """See :func:`run_process`; waits until a node is free."""
+        return self._ray.get(self._run.remote(command, log))
+
+
+Engine = LocalEngine | RayEngine
