@@ -1,4 +1,4 @@
-# Two commands do everything from a fresh clone: `make train` and `make test`.
+# Two commands do everything from a fresh clone: `make train` and `make test`. `make benchmark` reproduces a comparison.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -7,13 +7,14 @@ NOISE ?= 0.1
 STEPS ?= 50000
 SEED ?= 0
 RUNS ?= runs
+SUITE ?= smoke
 WORKERS ?= auto
 ARGS ?=
 
 BIN := $(VENV)/bin
 CODE := sb3_gac benchmarks tests
 
-.PHONY: train test format lint type clean
+.PHONY: train test benchmark format lint type clean
 
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -29,6 +30,11 @@ train: $(VENV)/.installed  ## train GAC, evaluate the learner on partial alone, 
 
 test: $(VENV)/.installed-dev  ## run the tests, several at a time
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(ARGS)
+
+benchmark: $(VENV)/.installed-dev  ## runs of a suite, resumed if need be, to figure, tables and page in benchmarks/results/
+	$(BIN)/python -m benchmarks.launch benchmarks/suites/$(SUITE).yml
+	$(BIN)/python -m benchmarks.aggregate benchmarks/suites/$(SUITE).yml --out benchmarks/results/$(SUITE)
+	$(BIN)/python -m benchmarks.report benchmarks/results/$(SUITE)
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix $(CODE)

@@ -20,8 +20,6 @@ import pandas as pd
 from plotly import graph_objects
 from plotly.subplots import make_subplots
 
-from benchmarks.suite import HERE
-
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
@@ -201,7 +199,9 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, help="path of the results, without a suffix")
-    parser.add_argument("--runs", type=Path, default=HERE / "runs", help="what the page's links to logs point at")
+    parser.add_argument(
+        "--runs", type=Path, default=Path(__file__).parent / "runs", help="what the page's links to logs point at"
+    )
     options = parser.parse_args()
     tidy = pd.read_csv(options.results.with_suffix(".csv"))
     results = json.loads(options.results.with_suffix(".json").read_text())
