@@ -44,6 +44,23 @@ class TwoViewBandit(gym.Env):
         return {"partial": partial, "privileged": np.array([self._target], dtype=np.float32)}
 
 
+class TwoViewChoice(TwoViewBandit):
+    """
+    Three actions instead of a number: 1 for the one whose third of the range holds the target, else 0.
+
+    With ``noise_std`` = 0 both views tell it.
+    """
+
+    def __init__(self, noise_std: float = 0.0, length: int = 1):
+        super().__init__(noise_std, length)
+        self.action_space = spaces.Discrete(3)
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict]:
+        target = self._target
+        observation, _, terminated, truncated, info = super().step(np.zeros(1))
+        return observation, float(action == np.digitize(target, [-0.8 / 3, 0.8 / 3])), terminated, truncated, info
+
+
 def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
     """A model whose gradient steps take a few milliseconds."""
     defaults = {

@@ -1,17 +1,19 @@
 """Soft Actor-Critic whose critics see more than its actor: SAC-asym, and with other keys SAC on either view."""
 
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_gac.common.actors import LOG_STD_BOUNDS, DeployedPolicy
+from sb3_gac.common.actors import DeployedPolicy
 from sb3_gac.common.compilation import compilable
-from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.common.distributions import Distribution
+from sb3_gac.common.heads import LOG_STD_BOUNDS
 from sb3_gac.common.losses import learner_loss, learner_target
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.common.policies import AsymmetricPolicy
@@ -19,31 +21,12 @@ from sb3_gac.common.roles import Roles
 from sb3_gac.common.training import Batch, Descent, Metrics
 
 
-class SquashedGaussianActor(DeployedPolicy):
-    """SAC's actor: mean and log standard deviation from one network."""
-
-    def forward(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
-        """
-        :param obs: observation with at least the actor's entries, B of each
-        :return: mean and log standard deviation before tanh, both (B, A)
-        """
-        latent = self.latent(obs)
-        return self.mean(latent), self.bounded_log_std(latent)
-
-    def distribution(self, obs: PyTorchObs) -> TanhGaussian:
-        """
-        :param obs: observation with at least the actor's entries, B of each
-        :return: shapes (B, A)
-        """
-        return TanhGaussian(*self(obs))
-
-
 class AsymmetricSACPolicy(AsymmetricPolicy):
     """
     An actor and twin critics, each on the entries of its role, "actor" or "critic".
 
     :param observation_space: Dict
-    :param action_space: Box
+    :param action_space: Box or Discrete
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}`` or ``{"actor", "critic"}``
     :param activation_fn: between layers
@@ -56,7 +39,7 @@ class AsymmetricSACPolicy(AsymmetricPolicy):
     def __init__(
         self,
         observation_space: spaces.Dict,
-        action_space: spaces.Box,
+        action_space: spaces.Space,
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.SiLU,
@@ -65,7 +48,7 @@ class AsymmetricSACPolicy(AsymmetricPolicy):
     ):
         super().__init__(observation_space, action_space, net_arch, activation_fn, **kwargs)
         self.constructor_options["log_std_bounds"] = log_std_bounds
-        self.actor = SquashedGaussianActor(**self._role_kwargs("actor"), log_std_bounds=log_std_bounds)
+        self.actor = DeployedPolicy(**self._role_kwargs("actor"), log_std_bounds=log_std_bounds)
         shared = self.actor.features_extractor if self.share_features_extractor else None
         self.critic, self.critic_target = self._make_critic_and_target("critic", shared)
         self._finish(lr_schedule)
@@ -77,7 +60,7 @@ class AsymmetricSACPolicy(AsymmetricPolicy):
 
     def behaviour_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
         """
-        The actor's action, in [-1, 1].
+        The actor's action, in [-1, 1] or one of a number.
 
         :param observation: with at least the actor's entries, single or batched
         :param deterministic: mode instead of a sample
@@ -105,13 +88,13 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         ent_coef = self.ent_coef_dual.value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
         metrics = self._step("critic", self._fit(batch, noise[0], ent_coef))
-        descent, log_prob, log_std = self._climb(batch, noise[1], ent_coef)
+        descent, log_prob, actor = self._climb(batch, noise[1], ent_coef)
         metrics |= self._step("actor", descent)
         metrics |= self.ent_coef_dual.update(log_prob + float(self.target_entropy))
         if diagnose:
             metrics["ent_coef"] = self.ent_coef_dual.value
             metrics["entropy"] = -log_prob.mean()
-            metrics["std"] = log_std.exp().mean()
+            metrics |= {f"actor_{name}": value for name, value in actor.diagnostics().items()}
         return metrics
 
     @compilable
@@ -120,15 +103,14 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
 
     @th.no_grad()
     def _target(self, batch: Batch, noise: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
-        action, log_prob = self.policy.actor.distribution(batch.next_observations).sample_with_log_prob(noise)
-        next_q = self.policy.critic_target(batch.next_observations, action)
+        actor = self.policy.actor(batch.next_observations)
+        next_q, log_prob = actor.expectation(partial(self.policy.critic_target, batch.next_observations), noise)
         return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, ent_coef)
 
     @compilable
-    def _climb(self, batch: Batch, noise: th.Tensor, ent_coef: th.Tensor) -> tuple[Descent, th.Tensor, th.Tensor]:
-        """The actor's descent, its log-probability (B,) and log standard deviation (B, A), detached."""
-        actor = self.policy.actor.distribution(batch.observations)
-        action, log_prob = actor.sample_with_log_prob(noise)
-        q = self.policy.critic(batch.observations, action)
+    def _climb(self, batch: Batch, noise: th.Tensor, ent_coef: th.Tensor) -> tuple[Descent, th.Tensor, Distribution]:
+        """The actor's descent, its log-probability (B,) and its distribution, detached."""
+        actor = self.policy.actor(batch.observations)
+        q, log_prob = actor.expectation(partial(self.policy.critic, batch.observations), noise)
         descent = self._descent("actor", learner_loss(0.0, q, 0.0, log_prob, ent_coef))
-        return descent, log_prob.detach(), actor.log_std.detach()
+        return descent, log_prob.detach(), actor.detach()

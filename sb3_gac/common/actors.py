@@ -7,23 +7,21 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_gac.common.distributions import TanhGaussian
-from sb3_gac.common.networks import Head, RoleModel
-
-LOG_STD_BOUNDS = (-5.0, 1.0)
+from sb3_gac.common.distributions import Distribution
+from sb3_gac.common.heads import LOG_STD_BOUNDS, make_head
+from sb3_gac.common.networks import RoleModel
 
 
 class RolePolicy(RoleModel, BasePolicy):
     """
-    A policy network on the entries of its role: encoder and hidden layers; subclasses add the heads.
+    A policy network on the entries of its role: encoder, hidden layers, and the head that fits the actions.
 
     :param observation_space: the entries that this role reads
-    :param action_space: Box
+    :param action_space: Box or Discrete
     :param net_arch: hidden layer sizes
     :param features_extractor: encoder of the entries
     :param features_dim: its output size
@@ -35,11 +33,12 @@ class RolePolicy(RoleModel, BasePolicy):
     """
 
     features_extractor: BaseFeaturesExtractor
+    head: Any  # GaussianHead or CategoricalHead, which nn.Module hides from type checkers
 
     def __init__(
         self,
         observation_space: spaces.Dict,
-        action_space: spaces.Box,
+        action_space: spaces.Space,
         net_arch: list[int],
         features_extractor: BaseFeaturesExtractor,
         features_dim: int,
@@ -53,7 +52,7 @@ class RolePolicy(RoleModel, BasePolicy):
             action_space,
             features_extractor=features_extractor,
             normalize_images=normalize_images,
-            squash_output=True,
+            squash_output=isinstance(action_space, spaces.Box),
         )
         self.rest_extractor = rest_extractor
         self.net_arch = net_arch
@@ -62,9 +61,14 @@ class RolePolicy(RoleModel, BasePolicy):
         self.log_std_bounds = log_std_bounds
         self.latent_net = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
         latent_dim = net_arch[-1] if net_arch else features_dim
-        action_dim = get_action_dim(action_space)
-        self.mean = Head(latent_dim, action_dim)
-        self.log_std = Head(latent_dim, action_dim)
+        self.head = make_head(latent_dim, action_space, log_std_bounds)
+
+    def forward(self, obs: PyTorchObs) -> Distribution:
+        """
+        :param obs: observation with at least the entries of this role, B of each
+        :return: of actions, or of what makes them, shapes (B, A)
+        """
+        return self.head(self.latent(obs))
 
     def latent(self, obs: PyTorchObs) -> th.Tensor:
         """
@@ -72,13 +76,6 @@ class RolePolicy(RoleModel, BasePolicy):
         :return: last hidden layer, shape (B, H)
         """
         return self.latent_net(self.extract_features(obs, self.features_extractor))
-
-    def bounded_log_std(self, latent: th.Tensor) -> th.Tensor:
-        """
-        :param latent: shape (B, H)
-        :return: log standard deviation before tanh, shape (B, A)
-        """
-        return self.log_std(latent).clamp(*self.log_std_bounds)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {
@@ -92,11 +89,7 @@ class RolePolicy(RoleModel, BasePolicy):
 
 
 class DeployedPolicy(RolePolicy):
-    """
-    The policy that ``predict`` stands for: it needs its own entries and ignores all others.
-
-    A subclass's ``forward`` gives mean and log standard deviation before tanh, both of shape (B, A).
-    """
+    """The policy that ``predict`` stands for: it needs its own entries and ignores all others."""
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """
@@ -120,5 +113,5 @@ class DeployedPolicy(RolePolicy):
         return {key: observation[key] for key in keys}
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        action = TanhGaussian(*self(observation))
-        return action.mode if deterministic else action.sample()
+        actions = self(observation)
+        return actions.mode if deterministic else actions.sample()

@@ -1,12 +1,20 @@
-"""Tanh-squashed diagonal Gaussians: sampling, log-probability, and the KL divergence of two that share a std."""
+"""
+Action distributions: tanh-squashed diagonal Gaussians, of which guider and learner share a std, and categorical ones.
+
+Both answer the same questions, so that one update serves both: the expected value and log-probability of their actions
+(by one sample, or exactly), KL divergence, a correction on top of another, and what one borrows of another.
+"""
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import torch as th
 import torch.nn.functional as F
 
 KL_REDUCTIONS = ("mean", "sum")
+#: Actions, or None for all of them -> values, see the critic ensembles
+QFunction: TypeAlias = Callable[[Any], th.Tensor]
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
@@ -44,6 +52,36 @@ class TanhGaussian(NamedTuple):
         pre_tanh = self._pre_tanh(noise)
         return th.tanh(pre_tanh), self._log_prob(pre_tanh, noise)
 
+    def expectation(self, q_function: QFunction, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param q_function: actions -> values of N critics, shape (N, \\*E)
+        :param noise: standard normal, shape (\\*E, A)
+        :return: values of one sample, shape (N, \\*E), and its log-probability, shape (\\*E)
+        """
+        action, log_prob = self.sample_with_log_prob(noise)
+        return q_function(action), log_prob
+
+    def kl(self, other: "TanhGaussian", reduction: str = "mean") -> th.Tensor:
+        """KL(self || other), shape (\\*E), with the std that ``other`` borrowed: see :func:`kl_shared_std`."""
+        return kl_shared_std(self.mean, other.mean, other.log_std.exp(), reduction)
+
+    def corrected(self, correction: "TanhGaussian") -> "TanhGaussian":
+        """
+        This distribution, as a constant, with its mean moved by a correction, and the correction's std.
+
+        :param correction: its mean counts in units of its std; shapes (\\*E, A)
+        """
+        mean = self.mean.detach() + correction.log_std.detach().exp() * correction.mean
+        return TanhGaussian(mean, correction.log_std)
+
+    def borrowing(self, lender: "TanhGaussian") -> "TanhGaussian":
+        """This mean with the lender's std, as a constant."""
+        return TanhGaussian(self.mean, lender.log_std.detach())
+
+    def diagnostics(self) -> dict[str, th.Tensor]:
+        """Name -> scalar to log, detached."""
+        return {"std": self.log_std.detach().exp().mean(), "mean_abs": self.mean.detach().abs().mean()}
+
     def log_prob(self, pre_tanh: th.Tensor) -> th.Tensor:
         """
         Log-density of the action tanh(pre_tanh).
@@ -64,6 +102,62 @@ class TanhGaussian(NamedTuple):
         log_cosh = pre_tanh + F.softplus(pre_tanh * -2.0)  # but for a constant
         summed = th.addcmul(th.sub(log_cosh, self.log_std, alpha=0.5), standardised, standardised, value=-0.25).sum(dim=-1)
         return 2.0 * summed - pre_tanh.shape[-1] * (_LOG_SQRT_2PI + 2.0 * math.log(2.0))
+
+
+class Categorical(NamedTuple):
+    """
+    One of A actions.
+
+    :param logits: unnormalised log-probabilities, shape (\\*E, A)
+    """
+
+    logits: th.Tensor
+
+    @property
+    def mode(self) -> th.Tensor:
+        """The likeliest action, int64, shape (\\*E)."""
+        return self.logits.argmax(dim=-1)
+
+    def detach(self) -> "Categorical":
+        """The same distribution as a constant."""
+        return Categorical(self.logits.detach())
+
+    def sample(self) -> th.Tensor:
+        """An action, int64, shape (\\*E)."""
+        gumbel = -th.empty_like(self.logits).exponential_().log()
+        return (self.logits + gumbel).argmax(dim=-1)
+
+    def expectation(self, q_function: QFunction, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Exact, over all actions, and with the smallest critic's value of each.
+
+        :param q_function: None -> values of N critics, shape (N, \\*E, A)
+        :param noise: not needed
+        :return: expected value, shape (1, \\*E), and expected log-probability, shape (\\*E)
+        """
+        log_probs = self.logits.log_softmax(dim=-1)
+        probs = log_probs.exp()
+        return (probs * q_function(None).amin(dim=0)).sum(dim=-1)[None], (probs * log_probs).sum(dim=-1)
+
+    def kl(self, other: "Categorical", reduction: str = "sum") -> th.Tensor:
+        """KL(self || other), shape (\\*E); there are no dimensions to reduce over."""
+        log_probs = self.logits.log_softmax(dim=-1)
+        return (log_probs.exp() * (log_probs - other.logits.log_softmax(dim=-1))).sum(dim=-1)
+
+    def corrected(self, correction: "Categorical") -> "Categorical":
+        """This distribution, as a constant, with its logits moved by the correction's."""
+        return Categorical(self.logits.detach() + correction.logits)
+
+    def borrowing(self, lender: "Categorical") -> "Categorical":
+        """Itself: there is no std to borrow."""
+        return self
+
+    def diagnostics(self) -> dict[str, th.Tensor]:
+        """Name -> scalar to log, detached."""
+        return {"max_prob": self.logits.detach().softmax(dim=-1).amax(dim=-1).mean()}
+
+
+Distribution: TypeAlias = TanhGaussian | Categorical
 
 
 def kl_shared_std(guider_mean: th.Tensor, learner_mean: th.Tensor, std: th.Tensor, reduction: str = "mean") -> th.Tensor:

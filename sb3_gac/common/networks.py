@@ -180,7 +180,7 @@ class EnsembleOutput(nn.Module):
 
 class CriticEnsemble(RoleModel):
     """
-    Q-networks on the entries of one role, evaluated together.
+    Q-networks on the entries of one role, evaluated together: of actions that they are given.
 
     :param observation_space: the entries that this role reads
     :param action_space: Box
@@ -199,7 +199,7 @@ class CriticEnsemble(RoleModel):
     def __init__(
         self,
         observation_space: spaces.Dict,
-        action_space: spaces.Box,
+        action_space: spaces.Space,
         net_arch: list[int],
         features_extractor: BaseFeaturesExtractor,
         features_dim: int,
@@ -216,15 +216,19 @@ class CriticEnsemble(RoleModel):
         self.features_dim = features_dim
         self.activation_fn = activation_fn
         self.n_critics = n_critics
-        action_dim = get_action_dim(action_space)
-        self.input, layers = None, []
-        if net_arch:
-            self.input = EnsembleInput(n_critics, features_dim, action_dim, net_arch[0])
-            layers.append(activation_fn())
+        layers = [activation_fn()] if net_arch else []
         for in_features, out_features in itertools.pairwise(net_arch):
             layers += [EnsembleLinear(n_critics, in_features, out_features), activation_fn()]
         self.hidden = nn.Sequential(*layers)
-        self.output = EnsembleOutput(n_critics, net_arch[-1] if net_arch else features_dim + action_dim)
+        self._make_ends(features_dim)
+
+    def _make_ends(self, features_dim: int) -> None:
+        """First and last layer."""
+        action_dim = get_action_dim(self.action_space)
+        self.input: nn.Module | None = None
+        if self.net_arch:
+            self.input = EnsembleInput(self.n_critics, features_dim, action_dim, self.net_arch[0])
+        self.output: nn.Module = EnsembleOutput(self.n_critics, [features_dim + action_dim, *self.net_arch][-1])
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         """
@@ -247,3 +251,30 @@ class CriticEnsemble(RoleModel):
             "rest_extractor": self.rest_extractor,
             "n_critics": self.n_critics,
         }
+
+
+class DiscreteCriticEnsemble(CriticEnsemble):
+    """
+    Q-networks with a value for every action.
+
+    Arguments are those of :class:`CriticEnsemble`, but for ``action_space``: Discrete, of A actions.
+    """
+
+    def _make_ends(self, features_dim: int) -> None:
+        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+        widths = [features_dim, *self.net_arch]
+        self.input = EnsembleLinear(self.n_critics, features_dim, widths[1]) if self.net_arch else None
+        self.output = EnsembleLinear(self.n_critics, widths[-1], n_actions)
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param obs: observation with at least the entries of this role, B of each
+        :param actions: numbers of actions, shape (B, 1); ``None`` for all
+        :return: shape (N, B), or (N, B, A) of all actions
+        """
+        x = self.extract_features(obs, self.features_extractor)
+        x = x.expand(self.n_critics, *x.shape)
+        if self.input is not None:
+            x = self.hidden(self.input(x))
+        q = self.output(x)
+        return q if actions is None else q.gather(-1, actions.long().expand(self.n_critics, *actions.shape)).squeeze(-1)

@@ -14,12 +14,12 @@ from typing_extensions import Self
 
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.checks import (
-    UnsupportedActionSpaceError,
     check_finite_observation,
     check_positive,
     check_terminal_observations,
 )
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
+from sb3_gac.common.heads import check_action_space, resolve_target_entropy
 from sb3_gac.common.parallel import has_side_effects
 from sb3_gac.common.policies import AsymmetricPolicy
 from sb3_gac.common.roles import RoleKeys, resolve_lr_scales, resolve_role_keys
@@ -54,7 +54,7 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
     :param n_steps: rewards summed up in a critic's target before it bootstraps
     :param ent_coef: entropy temperature: "auto", "auto_<start value>" or a number
     :param target_update_interval: gradient steps between two updates of the targets
-    :param target_entropy: "auto" for -0.5 per action dimension, "sac" for SAC's -1 per dimension, or a number
+    :param target_entropy: in nats: "auto", "sac" or a number, see :func:`sb3_gac.common.heads.resolve_target_entropy`
     :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
     :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
@@ -181,11 +181,9 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         """
         :raises ValueError: naming the argument and the remedy
         """
-        if not isinstance(self.action_space, spaces.Box):
-            raise UnsupportedActionSpaceError(
-                f"{type(self).__name__} supports Box action spaces only, but the environment has {self.action_space}. "
-                "Wrap the environment so that its actions are continuous."
-            )
+        check_action_space(type(self).__name__, self.action_space)
+        if self.action_noise is not None and not isinstance(self.action_space, spaces.Box):
+            raise ValueError("action_noise can be added to Box actions only: leave it out.")
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
         if self.replay_buffer_class in (ReplayBuffer, NStepReplayBuffer):
@@ -196,16 +194,7 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         check_positive("target_update_interval", self.target_update_interval)
         if self.max_grad_norm is not None:
             check_positive("max_grad_norm", self.max_grad_norm, remedy="or None for no clipping")
-        self.target_entropy = self._resolve_target_entropy()
-
-    def _resolve_target_entropy(self) -> float:
-        per_dimension = {"auto": -0.5, "sac": -1.0}
-        if isinstance(self.target_entropy, str) and self.target_entropy in per_dimension:
-            return per_dimension[self.target_entropy] * float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
-        try:
-            return float(self.target_entropy)
-        except (TypeError, ValueError):
-            raise ValueError(f'target_entropy must be "auto", "sac" or a number, got {self.target_entropy!r}.') from None
+        self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
 
     def _policy_options(self) -> dict[str, Any]:
         """Arguments of the policy class that are arguments of the algorithm."""
@@ -272,7 +261,13 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         scaled_action, _ = self.policy.behaviour_action(self._last_obs)
         if action_noise is not None:
             scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
-        return self.policy.unscale_action(scaled_action), scaled_action
+        return self._in_environments_range(scaled_action), scaled_action
+
+    def _in_environments_range(self, action: np.ndarray) -> np.ndarray:
+        """
+        :param action: in [-1, 1], or one of a number
+        """
+        return self.policy.unscale_action(action) if isinstance(self.action_space, spaces.Box) else action
 
     def _setup_learn(
         self,

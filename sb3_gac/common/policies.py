@@ -16,7 +16,7 @@ from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy
 from sb3_gac.common.flat import FlatParameters
-from sb3_gac.common.networks import CriticEnsemble, VectorExtractor, polyak_average, trainable
+from sb3_gac.common.networks import CriticEnsemble, DiscreteCriticEnsemble, VectorExtractor, polyak_average, trainable
 from sb3_gac.common.roles import RoleKeys, Roles, resolve_lr_scales, resolve_net_arch, resolve_role_keys, role_space
 
 
@@ -28,7 +28,7 @@ class AsymmetricPolicy(BasePolicy):
     ``<name>_target`` where it is a critic, and then calls :meth:`_finish`.
 
     :param observation_space: Dict
-    :param action_space: Box
+    :param action_space: Box or Discrete
     :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}``, or one for each policy and one for "critic"
     :param activation_fn: between layers
     :param role_keys: role -> observation entries, see :func:`sb3_gac.common.roles.resolve_role_keys`
@@ -49,7 +49,7 @@ class AsymmetricPolicy(BasePolicy):
     def __init__(
         self,
         observation_space: spaces.Dict,
-        action_space: spaces.Box,
+        action_space: spaces.Space,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.SiLU,
         role_keys: RoleKeys | None = None,
@@ -69,7 +69,7 @@ class AsymmetricPolicy(BasePolicy):
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
-            squash_output=True,
+            squash_output=isinstance(action_space, spaces.Box),
             normalize_images=normalize_images,
         )
         self.constructor_options: dict[str, Any] = {
@@ -131,8 +131,9 @@ class AsymmetricPolicy(BasePolicy):
     def _make_critic_and_target(
         self, role: str, shared: BaseFeaturesExtractor | None
     ) -> tuple[CriticEnsemble, CriticEnsemble]:
-        critic = CriticEnsemble(**self._role_kwargs(role, shared), n_critics=self.n_critics)
-        target = CriticEnsemble(**self._role_kwargs(role, deepcopy(shared)), n_critics=self.n_critics)
+        ensemble = DiscreteCriticEnsemble if isinstance(self.action_space, spaces.Discrete) else CriticEnsemble
+        critic = ensemble(**self._role_kwargs(role, shared), n_critics=self.n_critics)
+        target = ensemble(**self._role_kwargs(role, deepcopy(shared)), n_critics=self.n_critics)
         target.load_state_dict(critic.state_dict())
         target.set_training_mode(False)
         return critic, target
@@ -211,7 +212,7 @@ class AsymmetricPolicy(BasePolicy):
     @abstractmethod
     def behaviour_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
         """
-        Action of the policy that collects the data, in [-1, 1].
+        Action of the policy that collects the data, in [-1, 1] or one of a number.
 
         :param observation: full observation, single or batched
         :param deterministic: mode instead of a sample
@@ -237,7 +238,7 @@ class AsymmetricPolicy(BasePolicy):
         return self.deployed.predict(observation, state, episode_start, deterministic)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """The deployed policy's action in [-1, 1], shape (B, A)."""
+        """The deployed policy's action, in [-1, 1] of shape (B, A), or one of a number of shape (B,)."""
         return self._predict(obs, deterministic)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:

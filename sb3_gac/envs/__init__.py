@@ -2,13 +2,14 @@
 
 from sb3_gac.envs.mujoco import make_mujoco, register_mujoco
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
-from sb3_gac.envs.wrappers import History, SensorNoise, SplitDictObservation, SplitObservation
+from sb3_gac.envs.wrappers import FlattenMultiDiscrete, History, SensorNoise, SplitDictObservation, SplitObservation
 
 register_mujoco()
 
 __all__ = [
     "PARTIAL",
     "PRIVILEGED",
+    "FlattenMultiDiscrete",
     "History",
     "SensorNoise",
     "SplitDictObservation",

@@ -6,33 +6,32 @@ import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.common.actors import DeployedPolicy, RolePolicy
-from sb3_gac.common.distributions import TanhGaussian, project_to_kl_ball
+from sb3_gac.common.distributions import Distribution, TanhGaussian, project_to_kl_ball
 
 DELTA_INIT_SCALE = 0.01
 
 
 class Learner(DeployedPolicy):
     """
-    The deployed policy: a mean on the learner's entries.
+    The deployed policy.
 
-    In training it borrows the guider's std. Its own log-std head, fitted to the guider's, serves
+    In training a Gaussian borrows the guider's std. Its own, fitted to the guider's, serves
     ``predict(deterministic=False)`` where there is no guider.
     """
 
-    def forward(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+    def forward(self, obs: PyTorchObs) -> Distribution:
         """
         :param obs: observation with at least the learner's entries, B of each
-        :return: mean before tanh, and the deployment log std, whose gradient stops at its head; both (B, A)
+        :return: at deployment; the gradient of a std stops at its own layer; shapes (B, A)
         """
-        latent = self.latent(obs)
-        return self.mean(latent), self.bounded_log_std(latent.detach())
+        return self.head(self.latent(obs), detach_std=True)
 
 
 class Guider(RolePolicy):
     """
-    The privileged policy in the paper's form: mean and std from its own network, nothing shared with the learner.
+    The privileged policy in the paper's form: a network of its own, nothing shared with the learner.
 
-    :param max_kl: hard bound on KL(guider || learner), or ``None``: the mean is projected onto that ball
+    :param max_kl: hard bound on KL(guider || learner), or ``None``: a Gaussian's mean is projected onto that ball
     :param kl_reduction: how the bounded KL is reduced over action dimensions
     """
 
@@ -41,28 +40,22 @@ class Guider(RolePolicy):
         self.max_kl = max_kl
         self.kl_reduction = kl_reduction
 
-    def forward(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+    def relative_to(self, learner: Any, output: Any) -> Distribution:
         """
-        :param obs: observation with at least the guider's entries, B of each
-        :return: what :meth:`relative_to` makes a mean of, and the log std before tanh; both (B, A)
+        :param learner: its distribution for the same observations; treated as a constant, shapes (B, A)
+        :param output: of :meth:`forward`, shapes (B, A)
+        :return: the guider's action distribution, shapes (B, A)
         """
-        latent = self.latent(obs)
-        return self.mean(latent), self.bounded_log_std(latent)
-
-    def relative_to(self, learner_mean: th.Tensor, output: th.Tensor, log_std: th.Tensor) -> TanhGaussian:
-        """
-        :param learner_mean: the learner's mean for the same observations; treated as a constant, shape (B, A)
-        :param output: of :meth:`forward`, shape (B, A)
-        :param log_std: of :meth:`forward`, shape (B, A)
-        :return: action distribution, shapes (B, A)
-        """
-        return TanhGaussian(self._guided_mean(output, learner_mean.detach(), log_std.detach().exp()), log_std)
-
-    def _guided_mean(self, output: th.Tensor, learner_mean: th.Tensor, std: th.Tensor) -> th.Tensor:
         if self.max_kl is None:
             return output
-        offset = project_to_kl_ball((output - learner_mean) / std, self.max_kl, self.kl_reduction)
-        return learner_mean + std * offset
+        offset = (output.mean - learner.mean.detach()) / output.log_std.detach().exp()
+        return learner.corrected(self._bounded(output._replace(mean=offset)))
+
+    def _bounded(self, correction: Any) -> Any:
+        if self.max_kl is None:
+            return correction
+        assert isinstance(correction, TanhGaussian)
+        return correction._replace(mean=project_to_kl_ball(correction.mean, self.max_kl, self.kl_reduction))
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         raise TypeError("The guider is defined relative to the learner: use GAC.predict_guider().")
@@ -73,20 +66,19 @@ class Guider(RolePolicy):
 
 class ResidualGuider(Guider):
     """
-    The guider as the learner plus a privileged correction delta in units of the std: KL = 1/2 ||delta||^2 exactly.
+    The guider as the learner plus a privileged correction delta: in units of the std, so that KL = 1/2 ||delta||^2
+    exactly, or of the logits.
 
-    Neither the learner's drift nor a shrinking std moves the KL; delta = 0 is the learner itself.
+    Neither the learner's drift nor a shrinking std moves that KL; delta = 0 is the learner itself.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        with th.no_grad():
-            self.mean.weight.mul_(DELTA_INIT_SCALE)
-            self.mean.bias.mul_(DELTA_INIT_SCALE)
+        self.head.shrink(DELTA_INIT_SCALE)
 
-    def _guided_mean(self, output: th.Tensor, learner_mean: th.Tensor, std: th.Tensor) -> th.Tensor:
-        delta = output if self.max_kl is None else project_to_kl_ball(output, self.max_kl, self.kl_reduction)
-        return learner_mean + std * delta
+    def relative_to(self, learner: Any, output: Any) -> Distribution:
+        """See :meth:`Guider.relative_to`."""
+        return learner.corrected(self._bounded(output))
 
 
 GUIDERS: dict[str, type[Guider]] = {"residual": ResidualGuider, "independent": Guider}

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
@@ -142,6 +143,8 @@ class GAC(GuidedUpdate):
         check_choice("guider", self.guider, GUIDERS)
         if self.max_kl is not None:
             check_positive("max_kl", self.max_kl, remedy="or None for no hard bound")
+            if not isinstance(self.action_space, spaces.Box):
+                raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
         if self.learner_kl_scale == "auto":
             self.learner_kl_scale = 0.0 if self.guider == "residual" else 1.0
         check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
@@ -180,7 +183,7 @@ class GAC(GuidedUpdate):
         """
         self.policy.set_training_mode(False)
         scaled_action, vectorized = self.policy.behaviour_action(observation, deterministic)
-        action = self.policy.unscale_action(scaled_action)
+        action = self._in_environments_range(scaled_action)
         return (action if vectorized else action.squeeze(axis=0)), state
 
     def _dual_names(self) -> list[str]:

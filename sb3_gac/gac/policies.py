@@ -1,4 +1,4 @@
-"""Guider, learner and four critics: the networks of Guided Actor-Critic for Box actions."""
+"""Guider, learner and four critics: the networks of Guided Actor-Critic for Box and Discrete actions."""
 
 from typing import Any, NamedTuple
 
@@ -8,14 +8,12 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_gac.common.actors import LOG_STD_BOUNDS
-from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.common.distributions import Distribution
+from sb3_gac.common.heads import LOG_STD_BOUNDS
 from sb3_gac.common.networks import CriticEnsemble
 from sb3_gac.common.policies import AsymmetricPolicy
 from sb3_gac.common.roles import Roles
 from sb3_gac.gac.actors import GUIDERS, Learner
-
-ActorOutputs = tuple[th.Tensor, th.Tensor]
 
 
 class ActionDistributions(NamedTuple):
@@ -23,13 +21,13 @@ class ActionDistributions(NamedTuple):
     Both policies for one batch.
 
     :param guider: shapes (B, A)
-    :param learner: with the guider's std, as a constant, shapes (B, A)
-    :param deployment_log_std: what the learner takes for the log std where there is no guider, shape (B, A)
+    :param learner: a Gaussian with the guider's std, as a constant, shapes (B, A)
+    :param deployed: the learner by itself, shapes (B, A)
     """
 
-    guider: TanhGaussian
-    learner: TanhGaussian
-    deployment_log_std: th.Tensor
+    guider: Any
+    learner: Any
+    deployed: Any
 
 
 class GACPolicy(AsymmetricPolicy):
@@ -37,7 +35,7 @@ class GACPolicy(AsymmetricPolicy):
     All networks of GAC and their optimisers. As a policy it is the learner: ``predict`` needs its entries alone.
 
     :param observation_space: Dict
-    :param action_space: Box
+    :param action_space: Box or Discrete
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}`` or ``{"guider", "learner", "critic"}``
     :param activation_fn: between layers
@@ -66,7 +64,7 @@ class GACPolicy(AsymmetricPolicy):
     def __init__(
         self,
         observation_space: spaces.Dict,
-        action_space: spaces.Box,
+        action_space: spaces.Space,
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.SiLU,
@@ -93,8 +91,7 @@ class GACPolicy(AsymmetricPolicy):
         self.learner_critic, self.learner_critic_target = None, None
         if learner_critics:
             self.learner_critic, self.learner_critic_target = self._make_critic_and_target("learner_critic", shared)
-        deployment_head = len(list(self.learner.log_std.parameters()))
-        self._finish(lr_schedule, unclipped=deployment_head)
+        self._finish(lr_schedule, unclipped=len(self.learner.head.deployment_parameters()))
 
     @property
     def actor(self) -> Learner:
@@ -125,19 +122,18 @@ class GACPolicy(AsymmetricPolicy):
         """
         return self.combine(self.guider(obs), self.learner(obs))
 
-    def combine(self, guider_outputs: ActorOutputs, learner_outputs: ActorOutputs) -> ActionDistributions:
+    def combine(self, guider_output: Distribution, learner_output: Distribution) -> ActionDistributions:
         """
-        :param guider_outputs: of the guider's network, for some batch
-        :param learner_outputs: of the learner's network, for the same batch
+        :param guider_output: of the guider's network, for some batch
+        :param learner_output: of the learner's network, for the same batch
         :return: shapes (B, A)
         """
-        learner_mean, deployment_log_std = learner_outputs
-        guider = self.guider.relative_to(learner_mean, *guider_outputs)
-        return ActionDistributions(guider, TanhGaussian(learner_mean, guider.log_std.detach()), deployment_log_std)
+        guider = self.guider.relative_to(learner_output, guider_output)
+        return ActionDistributions(guider, learner_output.borrowing(guider), learner_output)  # type: ignore[arg-type]
 
     def behaviour_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
         """
-        Action of the guider, in [-1, 1].
+        Action of the guider, in [-1, 1] or one of a number.
 
         :param observation: full observation, single or batched
         :param deterministic: mode instead of a sample

@@ -1,18 +1,19 @@
 """One gradient step of Guided Actor-Critic: Algorithm 1."""
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import torch as th
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_gac.common.compilation import compilable
-from sb3_gac.common.distributions import TanhGaussian, kl_shared_std
+from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.dual import Coefficient
-from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target, log_std_loss
+from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.common.training import Batch, Descent, Metrics
-from sb3_gac.gac.policies import ActionDistributions, ActorOutputs, GACPolicy
+from sb3_gac.gac.policies import ActionDistributions, GACPolicy
 
 
 class StepInputs(NamedTuple):
@@ -28,9 +29,9 @@ class StepInputs(NamedTuple):
     """
 
     batch: Batch
-    guider: ActorOutputs
-    learner: ActorOutputs
-    later: tuple[ActorOutputs, ActorOutputs]
+    guider: Distribution
+    learner: Distribution
+    later: tuple[Distribution, Distribution]
     kl_coef: th.Tensor
     ent_coef: th.Tensor
 
@@ -82,14 +83,14 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         )
 
     @compilable
-    def _on_both(self, name: str, batch: Batch) -> tuple[ActorOutputs, ActorOutputs]:
+    def _on_both(self, name: str, batch: Batch) -> tuple[Distribution, Distribution]:
         """A policy's outputs on the observations, and, as constants, on the next ones."""
         network = getattr(self.policy, name)
         now = network(batch.observations)
         with th.no_grad():
             return now, network(batch.next_observations)
 
-    def _outputs(self, name: str, inputs: StepInputs) -> ActorOutputs:
+    def _outputs(self, name: str, inputs: StepInputs) -> Distribution:
         """What a policy computes on the observations; compiled code can differentiate only what it computes itself."""
         return getattr(self.policy, name)(inputs.batch.observations) if self.compile else getattr(inputs, name)
 
@@ -115,9 +116,8 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     def _guider_descent(self, inputs: StepInputs, noise: th.Tensor) -> tuple[Descent, th.Tensor, th.Tensor]:
         """Eq. 13; with KL(guider || learner) and the guider's log-probability, detached, each of shape (B,)."""
         now = self.policy.combine(self._outputs("guider", inputs), inputs.learner)
-        action, log_prob = now.guider.sample_with_log_prob(noise)
-        kl = self._kl(now.guider, now.learner.detach())
-        q = self.policy.guider_critic(inputs.batch.observations, action)
+        q, log_prob = now.guider.expectation(partial(self.policy.guider_critic, inputs.batch.observations), noise)
+        kl = now.guider.kl(now.learner.detach(), self.kl_reduction)
         loss = guider_loss(kl, log_prob, q, inputs.kl_coef, inputs.ent_coef)
         return self._descent("guider", loss), kl.detach(), log_prob.detach()
 
@@ -125,9 +125,8 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     def _guided_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
         """Eq. 12, shape (B,)."""
         batch, later = inputs.batch, self.policy.combine(*inputs.later)
-        action, log_prob = later.guider.sample_with_log_prob(noise)
-        next_q = self.policy.guider_critic_target(batch.next_observations, action)
-        next_kl = self._kl(later.guider, later.learner)
+        next_q, log_prob = later.guider.expectation(partial(self.policy.guider_critic_target, batch.next_observations), noise)
+        next_kl = later.guider.kl(later.learner, self.kl_reduction)
         coefficients = (inputs.kl_coef, inputs.ent_coef)
         return guided_target(batch.rewards, batch.dones, next_q, next_kl, log_prob, *coefficients, batch.discounts)
 
@@ -153,16 +152,16 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     @compilable
     def _learner_descent(self, inputs: StepInputs, noise: th.Tensor) -> Descent:
         now = self.policy.combine(inputs.guider, self._outputs("learner", inputs))
-        deployment_loss = log_std_loss(now.deployment_log_std, now.learner.log_std)
-        gradient, metrics = self._descent("learner", self._learner_loss(inputs, now, noise), deployment_loss)
-        return Descent(gradient, metrics | {"log_std_loss": deployment_loss.detach()})
+        losses = self.policy.learner.head.deployment_losses(now.deployed, now.learner)
+        gradient, metrics = self._descent("learner", self._learner_loss(inputs, now, noise), sum(losses.values()))
+        return Descent(gradient, metrics | {name: loss.detach() for name, loss in losses.items()})
 
     @th.no_grad()
     def _learner_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
         """Eq. 15, shape (B,)."""
         batch = inputs.batch
-        action, log_prob = self.policy.combine(*inputs.later).learner.sample_with_log_prob(noise)
-        next_q = self.policy.critic_target(batch.next_observations, action)
+        learner = self.policy.combine(*inputs.later).learner
+        next_q, log_prob = learner.expectation(partial(self.policy.critic_target, batch.next_observations), noise)
         return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, self._learner_ent_coef(inputs))
 
     def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
@@ -174,21 +173,14 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         :param noise: standard normal, shape (B, A)
         :return: scalar
         """
-        action, log_prob = now.learner.sample_with_log_prob(noise)
-        q = self.policy.critic(inputs.batch.observations, action)
+        q, log_prob = now.learner.expectation(partial(self.policy.critic, inputs.batch.observations), noise)
         kl: th.Tensor | float = 0.0
         if self.learner_kl_scale:
-            kl = float(self.learner_kl_scale) * self._kl(now.guider.detach(), now.learner)
+            kl = float(self.learner_kl_scale) * now.guider.detach().kl(now.learner, self.kl_reduction)
         return learner_loss(kl, q, inputs.kl_coef, log_prob, self._learner_ent_coef(inputs))
 
     def _learner_ent_coef(self, inputs: StepInputs) -> th.Tensor | float:
         return inputs.ent_coef if self.learner_entropy else 0.0
-
-    # --- both -------------------------------------------------------------------------------------------------------
-
-    def _kl(self, guider: TanhGaussian, learner: TanhGaussian) -> th.Tensor:
-        """KL(guider || learner) with the std that ``learner`` borrowed, shape (B,)."""
-        return kl_shared_std(guider.mean, learner.mean, learner.log_std.exp(), self.kl_reduction)
 
     def _diagnostics(self, inputs: StepInputs, kl: th.Tensor, log_prob: th.Tensor) -> Metrics:
         target, learner = self.current_target_kl, self.policy.combine(inputs.guider, inputs.learner).learner
@@ -200,6 +192,5 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
             "kl_coef_on_bound": self.kl_coef_dual.on_bound(),
             "ent_coef": self.ent_coef_dual.value,
             "entropy": -log_prob.mean(),
-            "std": learner.log_std.exp().mean(),
-            "learner_mean_abs": learner.mean.detach().abs().mean(),
+            **{f"learner_{name}": value for name, value in learner.diagnostics().items()},
         }

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sb3_gac.common.distributions import TanhGaussian, kl_shared_std, project_to_kl_ball
+from sb3_gac.common.distributions import Categorical, TanhGaussian, kl_shared_std, project_to_kl_ball
+from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target
 from tests.common.golden import assert_close, golden
 
 DTYPES = pytest.mark.parametrize("dtype", [th.float64, th.float32], ids=["float64", "float32"])
@@ -121,3 +122,35 @@ def test_projection_of_zero_has_a_finite_gradient():
     offset = th.zeros(2, 3, requires_grad=True)
     project_to_kl_ball(offset, 0.01).sum().backward()
     assert th.isfinite(offset.grad).all()
+
+
+@pytest.mark.parametrize("dtype", [th.float64, th.float32])
+def test_categorical_expectations_and_losses(dtype):
+    """Every equation with exact sums over actions."""
+    case = golden("discrete", dtype)
+    guider, learner = Categorical(case["guider_logits"]), Categorical(case["learner_logits"])
+    noise = th.zeros(())
+    kl = guider.kl(learner)
+    assert_close(kl, case["kl"])
+    q_guided, log_prob = guider.expectation(lambda actions: case["q_guided"], noise)
+    assert_close(-log_prob, case["entropy_guider"])
+    kl_coef, ent_coef = case["kl_coef"], case["ent_coef"]
+    assert_close(guider_loss(kl, log_prob, q_guided, kl_coef, ent_coef), case["guider_loss_eq13"])
+    q_learner, _ = learner.expectation(lambda actions: case["q_learner"], noise)
+    assert_close(learner_loss(kl, q_learner, kl_coef), case["learner_loss_eq16"])
+    target = guided_target(case["reward"], case["done"], q_guided, kl, log_prob, kl_coef, ent_coef, case["gamma"])
+    assert_close(target, case["guided_target_eq12"])
+    assert_close(learner_target(case["reward"], case["done"], q_learner, case["gamma"]), case["learner_target_eq15"])
+
+
+def test_categorical_corrections_samples_and_modes():
+    th.manual_seed(0)
+    logits = th.tensor([1.0, 0.0, -1.0], requires_grad=True)
+    learner = Categorical(logits)
+    assert th.equal(learner.corrected(Categorical(th.zeros(3))).logits, logits)
+    corrected = learner.corrected(Categorical(th.tensor([0.0, 3.0, 0.0], requires_grad=True)))
+    assert corrected.mode.item() == 1
+    assert th.autograd.grad(corrected.logits.sum(), logits, allow_unused=True)[0] is None, "the learner is a constant"
+    samples = Categorical(logits.detach().expand(20_000, 3)).sample()
+    frequencies = th.bincount(samples, minlength=3) / 20_000
+    th.testing.assert_close(frequencies, logits.detach().softmax(-1), rtol=0, atol=0.015)

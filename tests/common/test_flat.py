@@ -96,8 +96,8 @@ def test_a_copied_policy_trains_on(network):
     before = {name: p.detach().clone() for name, p in model.policy.named_parameters()}
     model.train(1, 16)
     for name in (
-        "learner.mean.weight",
-        "guider.log_std.bias",
+        "learner.head.mean.weight",
+        "guider.head.log_std.bias",
         "learner_critic.output.bias",
         "guider_critic_target.output.bias",
     ):

@@ -6,10 +6,11 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC
-from tests.helpers import TwoViewBandit, small_model
+from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
 
 
 class _Poisoned(TwoViewBandit):
@@ -59,15 +60,34 @@ def test_box_observation():
         small_model("Pendulum-v1")
 
 
-def test_discrete_actions():
-    class Discrete(TwoViewBandit):
+@pytest.mark.parametrize(
+    ("space", "remedy"),
+    [
+        (spaces.MultiDiscrete([3, 2]), "FlattenMultiDiscrete"),
+        (spaces.MultiBinary(3), "FlattenMultiDiscrete"),
+        (spaces.Discrete(3, start=1), "count from 0"),
+        (spaces.Text(3), "continuous"),
+    ],
+)
+def test_other_actions(space, remedy):
+    class Other(TwoViewBandit):
         def __init__(self):
             super().__init__()
-            self.action_space = spaces.Discrete(3)
+            self.action_space = space
 
     for error in (ValueError, AssertionError):  # the second is SB3's convention
-        with pytest.raises(error, match=r"Box action spaces only.*Discrete\(3\)"):
-            small_model(Discrete())
+        with pytest.raises(
+            error, match=rf"Box and Discrete action spaces, but the environment has {type(space).__name__}"
+        ) as e:
+            small_model(Other())
+        assert remedy in str(e.value) or "must be an instance" in str(e.value)
+
+
+def test_what_discrete_actions_cannot_have():
+    with pytest.raises(ValueError, match="max_kl bounds the KL of Gaussians"):
+        small_model(TwoViewChoice(), max_kl=0.1)
+    with pytest.raises(ValueError, match="action_noise can be added to Box actions only"):
+        small_model(TwoViewChoice(), action_noise=NormalActionNoise(np.zeros(1), np.ones(1)))
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", "CnnPolicy", "Multi"])

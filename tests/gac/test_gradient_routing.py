@@ -26,7 +26,7 @@ def _reached(policy, loss):
     if "learner" in parts:  # the learner's deployment log-std head is a part of its own
         of_learner = {name.removeprefix("learner.") for name in touched if name.startswith("learner.")}
         parts -= {"learner"}
-        parts |= {"learner_log_std" if name.startswith("log_std.") else "learner" for name in of_learner}
+        parts |= {"learner_log_std" if name.startswith("head.log_std.") else "learner" for name in of_learner}
     return parts
 
 
@@ -38,14 +38,14 @@ def model(request):
 def test_guider_loss_moves_the_guider_alone(model):
     obs = _observations()
     guider, learner, _ = model.policy.distributions(obs)
-    kl = model._kl(guider, learner.detach())
+    kl = guider.kl(learner.detach())
     log_prob = guider.sample_with_log_prob(th.randn_like(guider.mean))[1]
     assert _reached(model.policy, guider_loss(kl, log_prob, th.zeros(2, 8), 1.0, 0.1)) == {"guider"}
 
 
 def test_learner_kl_moves_the_learner_alone_and_not_its_log_std_head(model):
     guider, learner, _ = model.policy.distributions(_observations())
-    kl = model._kl(TanhGaussian(guider.mean.detach() + 0.1, guider.log_std), learner)
+    kl = TanhGaussian(guider.mean.detach() + 0.1, guider.log_std).kl(learner)
     assert _reached(model.policy, distillation_loss(kl)) == {"learner"}
 
 
@@ -57,8 +57,8 @@ def test_learner_q_term_has_a_gradient_for_the_mean_but_not_for_the_borrowed_std
 
 
 def test_log_std_loss_moves_its_head_alone(model):
-    guider, _, deployment_log_std = model.policy.distributions(_observations())
-    loss = log_std_loss(deployment_log_std, guider.log_std.detach() + 1)
+    guider, _, deployed = model.policy.distributions(_observations())
+    loss = log_std_loss(deployed.log_std, guider.log_std.detach() + 1)
     assert _reached(model.policy, loss) == {"learner_log_std"}
 
 
@@ -70,12 +70,12 @@ def test_each_critic_loss_moves_its_own_critics(model, part):
 
 def test_kl_does_not_move_the_std(model):
     guider, learner, _ = model.policy.distributions(_observations())
-    kl = model._kl(TanhGaussian(guider.mean + 0.1, guider.log_std), learner.detach())
+    kl = TanhGaussian(guider.mean + 0.1, guider.log_std).kl(learner.detach())
     for parameter in model.policy.parameters():
         parameter.grad = None
     kl.sum().backward()
-    assert model.policy.guider.log_std.weight.grad is None
-    assert model.policy.guider.mean.weight.grad is not None
+    assert model.policy.guider.head.log_std.weight.grad is None
+    assert model.policy.guider.head.mean.weight.grad is not None
 
 
 def _changed_parts(model, update):
@@ -147,7 +147,7 @@ def test_guider_does_depend_on_privileged():
 def test_the_log_std_head_has_no_say_in_the_clipping_of_the_learner():
     """Its gradient belongs to another loss: a huge one must not shrink the learner's."""
     model = _filled(GAC, max_grad_norm=1.0)
-    head = list(model.policy.learner.log_std.parameters())
+    head = list(model.policy.learner.head.log_std.parameters())
     flat = model.policy.flat_parameters["learner"]
     assert [id(p) for p in flat.parameters[-2:]] == [id(p) for p in head]
     obs = _observations()

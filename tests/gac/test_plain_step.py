@@ -11,7 +11,7 @@ ALPHA_RATE, RATE, TAU, GAMMA, TARGET_KL = 3e-3, 3e-4, 0.005, 0.99, 0.0033
 
 
 def _plain_actor(policy):
-    return nn.ModuleDict({name: deepcopy(getattr(policy, name)) for name in ("latent_net", "mean", "log_std")})
+    return nn.ModuleDict(deepcopy({"latent_net": policy.latent_net, "mean": policy.head.mean, "log_std": policy.head.log_std}))
 
 
 def _plain_critics(ensemble):
@@ -110,8 +110,8 @@ def test_the_fast_step_is_the_plain_step():
     model = small_model(learning_starts=1000, learning_rate=RATE)
     model.learn(64)
     with th.no_grad():  # a guider that differs from its learner, a std that differs between states
-        model.policy.guider.mean.bias.add_(0.3)
-        model.policy.guider.log_std.weight.mul_(3.0)
+        model.policy.guider.head.mean.bias.add_(0.3)
+        model.policy.guider.head.log_std.weight.mul_(3.0)
     plain = PlainGAC(model)
     for seed in range(4):
         batch = model._sample_batch(32)
@@ -123,12 +123,12 @@ def test_the_fast_step_is_the_plain_step():
 
     policy, obs, actions = model.policy, batch.observations, batch.actions
     mean, guider_mean, std = plain.policies(obs)
-    guider, learner, deployment_log_std = policy.distributions(obs)
+    guider, learner, deployed = policy.distributions(obs)
     expected = {
         "learner": (learner.mean, mean),
         "guider": (guider.mean, guider_mean),
         "std": (guider.log_std.exp(), std),
-        "deployment std": (deployment_log_std, plain.learner["log_std"](plain.learner["latent_net"](obs["partial"]))),
+        "deployment std": (deployed.log_std, plain.learner["log_std"](plain.learner["latent_net"](obs["partial"]))),
         "Q_theta": (policy.guider_critic(obs, actions), th.stack(plain.q(plain.theta, obs, actions))),
         "Q_phi": (policy.learner_critic(obs, actions), th.stack(plain.q(plain.phi, obs, actions))),
         "Q_theta target": (policy.guider_critic_target(obs, actions), th.stack(plain.q(plain.theta_bar, obs, actions))),

@@ -111,7 +111,7 @@ def test_stochastic_actions_vary_and_follow_the_seed():
 def test_actions_are_unscaled_to_the_environments_range():
     model = make_gac()
     with th.no_grad():
-        model.actor.mean.bias.fill_(100.0)
+        model.actor.head.mean.bias.fill_(100.0)
     obs, _ = pendulum().reset()
     np.testing.assert_allclose(model.predict(obs, deterministic=True)[0], pendulum().action_space.high)
 
