@@ -1,7 +1,7 @@
 """
 How fast is a gradient step, and how large the buffer, beside SB3's SAC in the same run::
 
-    python -m benchmarks.speed --out benchmarks/results/speed [--threads 1 2] [--quick]
+    python -m benchmarks.speed --out benchmarks/results/speed [--threads 1 2] [--tables steps growth] [--quick]
 
 The contenders alternate in blocks, each in a process of its own; ratios are medians of the blocks' ratios.  The limit is
 that of the arithmetic: the step's matrix products at the rate of a plain one, timed in the same run.  Steps and buffers use
@@ -241,37 +241,50 @@ def profile_rollout(n_envs: int, vec_steps: int) -> dict[str, float]:
     }
 
 
-def measure(threads: list[int], quick: bool) -> dict[str, Any]:
-    """
-    :param threads: torch's, one table each
-    :param quick: one size and few rounds
-    :return: tables
-    """
-    rounds = 3 if quick else ROUNDS
-    results: dict[str, Any] = {"steps": [], "growth": [], "rollout": [], "wrappers": [compare_wrappers(rounds)], "buffers": []}
+def tabulate_steps(threads: list[int], quick: bool) -> list[dict[str, Any]]:
+    """Gradient steps: HalfCheetah with one thread, all sizes with more."""
+    rows = []
     for count in threads:
-        tasks = SIZES if count > 1 and not quick else ("HalfCheetah",)
-        for task, batch in [(task, batch) for task in tasks for batch in ((256, 512) if tasks is SIZES else (256,))]:
-            row = {"task": task, "threads": count, "batch": batch, "width": 256}
-            results["steps"].append(row | compare_steps(CONTENDERS, SIZES[task], batch, 256, count, rounds))
-    for batch, width, privileged in [] if quick else GROWTH:
+        several = count > 1 and not quick
+        for task in SIZES if several else ("HalfCheetah",):
+            for batch in (256, 512) if several else (256,):
+                row = {"task": task, "threads": count, "batch": batch, "width": 256}
+                rows.append(row | compare_steps(CONTENDERS, SIZES[task], batch, 256, count, 3 if quick else ROUNDS))
+    return rows
+
+
+def tabulate_growth(threads: list[int], quick: bool) -> list[dict[str, Any]]:
+    """Gradient steps by batch, width and size of the privileged entry, with the last number of threads."""
+    rows = []
+    for batch, width, privileged in GROWTH[:1] if quick else GROWTH:
         row = {"threads": threads[-1], "batch": batch, "width": width, "privileged": privileged}
-        growth = compare_steps(GROWTH_CONTENDERS, (8, privileged, 6), batch, width, threads[-1], rounds=3)
-        results["growth"].append(row | growth)
+        rows.append(row | compare_steps(GROWTH_CONTENDERS, (8, privileged, 6), batch, width, threads[-1], rounds=3))
+    return rows
+
+
+def tabulate_rollout(threads: list[int], quick: bool) -> list[dict[str, Any]]:
+    """Where training's time goes, by number of environments, with the last number of threads."""
+    th.set_num_threads(threads[-1])
+    rows = []
     for n_envs in ENVS:
         vec_steps = max(4, (100 if quick else 1_000) // n_envs)
-        results["rollout"].append({"envs": n_envs, "threads": threads[-1]} | profile_rollout(n_envs, vec_steps))
-    for task, sizes in SIZES.items():
-        results["buffers"].append({"task": task} | compare_buffers(sizes))
-    return results
+        rows.append({"envs": n_envs, "threads": threads[-1]} | profile_rollout(n_envs, vec_steps))
+    return rows
+
+
+TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name -> threads, whether to be quick -> rows
+    "wrappers": lambda threads, quick: [compare_wrappers(3 if quick else ROUNDS)],
+    "steps": tabulate_steps,
+    "growth": tabulate_growth,
+    "rollout": tabulate_rollout,
+    "buffers": lambda threads, quick: [{"task": task} | compare_buffers(sizes) for task, sizes in SIZES.items()],
+}
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """
     :param rows: with the same keys
     """
-    if not rows:
-        return ""
     lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
     return "\n".join([*lines, *("| " + " | ".join(str(value) for value in row.values()) + " |" for row in rows)])
 
@@ -281,15 +294,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--tables", choices=TABLES, nargs="+", default=list(TABLES))
+    parser.add_argument("--quick", action="store_true", help="one size and few rounds")
     options = parser.parse_args()
-    results = measure(options.threads, options.quick)
+    flags = f"--threads {' '.join(map(str, options.threads))} --tables {' '.join(options.tables)}"
+    record = {"command": f"python -m benchmarks.speed {flags}{' --quick' if options.quick else ''}", **provenance()}
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    flags = f"--threads {' '.join(map(str, options.threads))}{' --quick' if options.quick else ''}"
-    record = {"command": f"python -m benchmarks.speed {flags}", **provenance(), **results}
-    options.out.with_suffix(".json").write_text(json.dumps(record, indent=1))
-    for name in ("steps", "growth", "rollout", "wrappers", "buffers"):
-        print(f"\n{name}\n\n{markdown(results[name])}")
+    for name in options.tables:
+        record[name] = TABLES[name](options.threads, options.quick)
+        options.out.with_suffix(".json").write_text(json.dumps(record, indent=1))
+        print(f"\n{name}\n\n{markdown(record[name])}", flush=True)
 
 
 if __name__ == "__main__":
