@@ -46,7 +46,7 @@ def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
     resolved: dict[str, Any] = {"buffer_size": min(1_000_000, max(spec.steps, 1_000))}
     for layer in (*_preset_layers(spec, algorithm_class), spec.overrides, own):
         resolved = merge(resolved, layer)
-    known = set(inspect.signature(algorithm_class).parameters) - {"policy", "env"}
+    known = set(inspect.signature(algorithm_class).parameters) - {"env"}
     unknown = sorted(set(resolved) - known)
     if unknown:
         raise ValueError(f"{spec.algorithm}: {algorithm_class.__name__} has no arguments {unknown}.")

@@ -21,6 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import torch as th
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
@@ -87,7 +88,7 @@ def _train(
     :return: one row per evaluation
     """
     started = time.time()
-    env_id, env_kwargs = f"sb3_gac/{spec.task}-v5", {"noise_std": spec.noise}
+    env_id, env_kwargs = environment(spec)
     env = make_vec_env(env_id, spec.envs, seed=spec.seed, env_kwargs=env_kwargs)
     eval_env = make_vec_env(env_id, spec.eval_episodes, env_kwargs=env_kwargs)
     evaluation = _evaluation_class(algorithm_class)(
@@ -95,7 +96,7 @@ def _train(
     )
     checkpoint = load_checkpoint(algorithm_class, directory, env, spec.seed)
     if checkpoint is None:
-        model = algorithm_class("MultiInputPolicy", env, **arguments, seed=spec.seed, device="cpu")
+        model = algorithm_class(**{"policy": "MultiInputPolicy", "env": env, **arguments, "seed": spec.seed, "device": "cpu"})
     else:
         model, evaluation.history = checkpoint
     model.set_logger(configure(str(directory / "tensorboard"), ["tensorboard"]))
@@ -106,6 +107,21 @@ def _train(
     seconds = {"seconds": time.time() - started, "steps": left}
     write_atomically(directory / "timing.json", json.dumps(seconds))
     return evaluation.history
+
+
+def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
+    """
+    :param spec: of a run
+    :return: id and keyword arguments of its environment; without sensor noise there need be no argument for it
+    :raises ValueError: if there is no such task
+    """
+    ids = [env_id for env_id in gymnasium.registry if env_id.rpartition("-v")[0] == f"sb3_gac/{spec.task}"]
+    if not ids:
+        raise ValueError(f"task must be one of the registered sb3_gac/<task>-v<version>, got {spec.task!r}.")
+    takes_noise = not spec.task.startswith("popgym-")
+    if spec.noise and not takes_noise:
+        raise ValueError(f"{spec.task} has no sensor noise: give noises: [0].")
+    return ids[0], {"noise_std": spec.noise} if takes_noise else {}
 
 
 def _evaluation_class(algorithm_class: type) -> type[sb3_gac.SeededEvalCallback]:

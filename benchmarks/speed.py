@@ -9,9 +9,7 @@ only spaces and sizes of the tasks, with random data; the rollout is that of Hal
 """
 
 import argparse
-import importlib.util
 import json
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -20,29 +18,14 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import Logger
 
 import sb3_gac
 from benchmarks.contenders import alternate, process_timers, timer
+from benchmarks.models import CONTENDERS, SIZES, SpacesOnly, make_step, matmul_rate, step_flops
+from benchmarks.profiles import env_step, profile_rollout, profile_step
 from benchmarks.run import provenance
 
-SIZES = {"HalfCheetah": (8, 17, 6), "Ant": (13, 27, 8), "Humanoid": (169, 270, 17)}
-COMPILED, MIXED = {"compile": True}, {"compile": True, "mixed_precision": True}
-CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {  # name -> class and arguments
-    "sac": (SAC, {}),
-    "gac": (sb3_gac.GAC, {}),
-    "gac-compiled": (sb3_gac.GAC, COMPILED),
-    "gac-mixed": (sb3_gac.GAC, MIXED),
-    "sac-asym": (sb3_gac.AsymmetricSAC, {}),
-    "sac-asym-compiled": (sb3_gac.AsymmetricSAC, COMPILED),
-}
-if importlib.util.find_spec("sbx"):
-    import sbx  # type: ignore[import-not-found]
-
-    CONTENDERS["sbx-sac"] = (sbx.SAC, {})
 GROWTH_CONTENDERS = ("sac", "gac", "gac-compiled")
 BLOCK, ROUNDS = 10, 9
 ENVS = (1, 8, 128)
@@ -51,82 +34,6 @@ GROWTH = [  # batch, width, size of the privileged entry
     *((256, width, 17) for width in (64, 512, 1024)),
     *((256, 256, privileged) for privileged in (9, 376, 1508)),
 ]
-
-
-class SpacesOnly(gym.Env):
-    """
-    An environment that is only asked for its spaces and for random observations.
-
-    :param partial: size of the partial entry
-    :param privileged: size of the privileged entry
-    :param actions: number of actions
-    """
-
-    def __init__(self, partial: int, privileged: int, actions: int):
-        self.observation_space = spaces.Dict(
-            partial=spaces.Box(-np.inf, np.inf, (partial,), np.float32),
-            privileged=spaces.Box(-np.inf, np.inf, (privileged,), np.float32),
-        )
-        self.action_space = spaces.Box(-1, 1, (actions,), np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """A random observation."""
-        super().reset(seed=seed)
-        return self.observation_space.sample(), {}
-
-    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """A random observation and reward."""
-        return self.observation_space.sample(), float(self.np_random.standard_normal()), False, False, {}
-
-
-def make_step(contender: str, sizes: tuple[int, int, int], batch: int, width: int) -> Callable[[], None]:
-    """
-    :param contender: a key of ``CONTENDERS``
-    :param sizes: partial, privileged, actions
-    :param batch: batch size
-    :param width: of the two hidden layers
-    :return: one gradient step, as ``learn`` makes it, on a buffer of random transitions
-    """
-    algorithm, arguments = CONTENDERS[contender]
-    settings = {"batch_size": batch, "learning_starts": 10**9, "buffer_size": 4_000, "seed": 0, "device": "cpu"} | arguments
-    if algorithm.__module__.startswith("sbx"):  # knows no dicts
-        env: gym.Env = gym.wrappers.FlattenObservation(SpacesOnly(*sizes))
-        model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [width, width]}, **settings)
-    else:
-        kwargs = {"net_arch": [width, width], "activation_fn": th.nn.SiLU}
-        model = algorithm("MultiInputPolicy", SpacesOnly(*sizes), policy_kwargs=kwargs, **settings)
-    model.set_logger(Logger(None, []))
-    model.learn(2_000)
-    return lambda: model.train(1, batch)
-
-
-def step_flops(sizes: tuple[int, int, int], batch: int, width: int) -> float:
-    """
-    Floating-point operations of the matrix products in one GAC step; gradients that nothing uses are not counted.
-
-    :param sizes: partial, privileged, actions
-    :param batch: B
-    :param width: H, of both hidden layers
-    """
-    partial, privileged, actions = sizes
-    full = partial + privileged
-
-    def passes(inputs: int, outputs: int, forward: int, weights: int, activations: int, input_gradients: int) -> float:
-        forward_cost = inputs * width + width * width + width * outputs
-        behind_the_first = width * width + width * outputs
-        return (forward + weights) * forward_cost + activations * behind_the_first + input_gradients * actions * width
-
-    critics = passes(full + actions, 1, forward=12, weights=4, activations=8, input_gradients=4)
-    guider = passes(full, 2 * actions, forward=2, weights=1, activations=1, input_gradients=0)
-    learner = passes(partial, 2 * actions, forward=2, weights=1, activations=1, input_gradients=0)
-    return 2.0 * batch * (critics + guider + learner)
-
-
-def matmul_rate(batch: int, width: int) -> float:
-    """Floating-point operations per second of one plain (B, H) x (H, H) product."""
-    x, weight = th.randn(batch, width), th.randn(width, width)
-    seconds = alternate({"mm": timer(lambda: th.mm(x, weight))}, repetitions=100, rounds=5)["mm"]
-    return 2.0 * batch * width * width / float(np.median(seconds))
 
 
 def compare_steps(
@@ -192,55 +99,6 @@ def compare_wrappers(rounds: int = ROUNDS) -> dict[str, float]:
     }
 
 
-def env_step(env: gym.Env) -> Callable[[], None]:
-    """
-    :param env: to step with one action over and over, reset where an episode ends
-    """
-    action = env.action_space.sample()
-    env.reset(seed=0)
-
-    def step() -> None:
-        if any(env.step(action)[2:4]):
-            env.reset()
-
-    return step
-
-
-def profile_rollout(n_envs: int, vec_steps: int) -> dict[str, float]:
-    """
-    Where the time of ``learn`` goes on HalfCheetah, with one gradient step per environment step.
-
-    :param n_envs: environments side by side
-    :param vec_steps: steps of all of them
-    :return: environment steps per second, and the shares of gradient steps, of physics (with our wrappers, without SB3's
-        vector environment), and of all else
-    """
-    vec_env = make_vec_env("sb3_gac/HalfCheetah-v5", n_envs, seed=0, env_kwargs={"noise_std": 0.1})
-    small = {**sb3_gac.preset("small"), "learning_starts": 0, "buffer_size": 50_000, "device": "cpu"}
-    model = sb3_gac.GAC("MultiInputPolicy", vec_env, **small)
-    model.learn(4 * n_envs)
-    spent = {"gradient": 0.0}
-    train = model.train
-
-    def timed_train(*args: Any, **kwargs: Any) -> None:
-        start = time.perf_counter()
-        train(*args, **kwargs)
-        spent["gradient"] += time.perf_counter() - start
-
-    model.train = timed_train  # type: ignore[method-assign]
-    start = time.perf_counter()
-    model.learn(vec_steps * n_envs)
-    total = time.perf_counter() - start
-    physics = n_envs * vec_steps * float(np.median([timer(env_step(vec_env.envs[0]))(300) for _ in range(5)]))  # type: ignore
-    shares = {"gradient_share": spent["gradient"] / total, "physics_share": physics / total}
-    rounded = {name: round(share, 3) for name, share in shares.items()}
-    return {
-        "steps_per_second": round(vec_steps * n_envs / total, 1),
-        **rounded,
-        "other_share": round(1 - sum(shares.values()), 3),
-    }
-
-
 def tabulate_steps(threads: list[int], quick: bool) -> list[dict[str, Any]]:
     """Gradient steps: HalfCheetah with one thread, all sizes with more."""
     rows = []
@@ -273,8 +131,9 @@ def tabulate_rollout(threads: list[int], quick: bool) -> list[dict[str, Any]]:
 
 
 TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name -> threads, whether to be quick -> rows
-    "wrappers": lambda threads, quick: [compare_wrappers(3 if quick else ROUNDS)],
+    "wrappers": lambda threads, quick: [compare_wrappers(3 if quick else 10 * ROUNDS)],
     "steps": tabulate_steps,
+    "profile": lambda threads, quick: profile_step("gac-compiled", SIZES["HalfCheetah"], 256, 256, 20 if quick else 200),
     "growth": tabulate_growth,
     "rollout": tabulate_rollout,
     "buffers": lambda threads, quick: [{"task": task} | compare_buffers(sizes) for task, sizes in SIZES.items()],

@@ -20,7 +20,7 @@ class RunSpec:
     One training run.
 
     :param algorithm: a name in ``hyperparams/algorithms.yml``
-    :param task: as in ``sb3_gac/<task>-v5``
+    :param task: as in ``sb3_gac/<task>-v<version>``
     :param noise: standard deviation of the sensor noise
     :param seed: of everything random
     :param steps: environment steps

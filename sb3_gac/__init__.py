@@ -4,6 +4,7 @@ from sb3_gac import envs
 from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
+from sb3_gac.common.episodes import EpisodeReplayBuffer
 from sb3_gac.common.normalization import DeploymentNormalizer
 from sb3_gac.gac.ablations import GACShare, GACWithoutQ
 from sb3_gac.gac.gac import GAC
@@ -17,6 +18,7 @@ __all__ = [
     "AsymmetricSAC",
     "CompactDictReplayBuffer",
     "DeploymentNormalizer",
+    "EpisodeReplayBuffer",
     "GACPolicy",
     "GACShare",
     "GACWithoutQ",

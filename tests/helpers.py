@@ -61,6 +61,43 @@ class TwoViewChoice(TwoViewBandit):
         return observation, float(action == np.digitize(target, [-0.8 / 3, 0.8 / 3])), terminated, truncated, info
 
 
+class Recall(gym.Env):
+    """
+    Shows one of three cues in the first step, then nothing; 1 for naming it in the last step, else 0.
+
+    ``privileged`` shows it all the time.
+
+    :param length: steps per episode
+    :param continuous: whether the answer is a number in [-1, 1], right within 1/3 of the cue's own -2/3, 0 or 2/3
+    """
+
+    def __init__(self, length: int = 4, continuous: bool = False):
+        self.observation_space = spaces.Dict(
+            partial=spaces.Box(0, 1, (4,), np.float32), privileged=spaces.Box(0, 1, (3,), np.float32)
+        )
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32) if continuous else spaces.Discrete(3)
+        self.length = length
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
+        super().reset(seed=seed)
+        self._cue, self._step = int(self.np_random.integers(3)), 0
+        return self._views(), {}
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict]:
+        if isinstance(self.action_space, spaces.Box):
+            action = int(np.digitize(np.ravel(action)[0], [-1 / 3, 1 / 3]))
+        self._step += 1
+        last = self._step == self.length
+        return self._views(), float(last and action == self._cue), last, False, {}
+
+    def _views(self) -> dict[str, np.ndarray]:
+        partial = np.zeros(4, dtype=np.float32)
+        if self._step == 0:
+            partial[self._cue] = 1.0
+        partial[3] = float(self._step == self.length - 1)
+        return {"partial": partial, "privileged": np.eye(3, dtype=np.float32)[self._cue]}
+
+
 def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
     """A model whose gradient steps take a few milliseconds."""
     defaults = {

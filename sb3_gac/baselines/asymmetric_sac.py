@@ -1,7 +1,6 @@
 """Soft Actor-Critic whose critics see more than its actor: SAC-asym, and with other keys SAC on either view."""
 
-from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import torch as th
@@ -14,11 +13,14 @@ from sb3_gac.common.actors import DeployedPolicy
 from sb3_gac.common.compilation import compilable
 from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.heads import LOG_STD_BOUNDS
-from sb3_gac.common.losses import learner_loss, learner_target
+from sb3_gac.common.losses import learner_loss, learner_target, masked_mean
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
-from sb3_gac.common.policies import AsymmetricPolicy
+from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
 from sb3_gac.common.roles import Roles
 from sb3_gac.common.training import Batch, Descent, Metrics
+
+#: The actor's distributions on the observations and on the next ones, see :meth:`Batch.outputs`; ``None`` to compute them
+Outputs: TypeAlias = tuple[Any, Any] | None
 
 
 class AsymmetricSACPolicy(AsymmetricPolicy):
@@ -58,18 +60,30 @@ class AsymmetricSACPolicy(AsymmetricPolicy):
         """The actor climbs the critics: one cannot go without the other."""
         return False
 
-    def behaviour_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
-        """
-        The actor's action, in [-1, 1] or one of a number.
-
-        :param observation: with at least the actor's entries, single or batched
-        :param deterministic: mode instead of a sample
-        :return: shape (B, \\*action shape), and whether the observation was batched
-        """
-        obs, vectorized = self.actor.obs_to_tensor(observation)
+    def behaviour_action(
+        self,
+        observation: dict[str, np.ndarray],
+        state: BehaviourState = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, BehaviourState]:
+        """The actor's, see :meth:`AsymmetricPolicy.behaviour_action`."""
+        obs, _ = self.actor.obs_to_tensor(observation)
         with th.no_grad():
-            action = self.actor._predict(obs, deterministic)
-        return action.cpu().numpy().reshape(-1, *self.action_space.shape), vectorized  # type: ignore[misc]
+            actions, after = self.actor.remember(obs, state[0] if state else None, episode_start)
+            return self._chosen(actions, deterministic), None if after is None else (after,)
+
+
+class AsymmetricSACGruPolicy(AsymmetricSACPolicy):
+    """Both networks with a GRU each."""
+
+    cell = "gru"
+
+
+class AsymmetricSACLstmPolicy(AsymmetricSACPolicy):
+    """Both networks with an LSTM each."""
+
+    cell = "lstm"
 
 
 class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
@@ -80,37 +94,45 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
     "privileged"]}`` SAC on the full state. Arguments are those of :class:`AsymmetricOffPolicyAlgorithm`.
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": AsymmetricSACPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MultiInputPolicy": AsymmetricSACPolicy,
+        "MultiInputGruPolicy": AsymmetricSACGruPolicy,
+        "MultiInputLstmPolicy": AsymmetricSACLstmPolicy,
+    }
     policy: AsymmetricSACPolicy
 
     def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
         """SAC's critics are eq. 15's with the entropy term, its actor eq. 16's without a guider."""
         ent_coef = self.ent_coef_dual.value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
-        metrics = self._step("critic", self._fit(batch, noise[0], ent_coef))
-        descent, log_prob, actor = self._climb(batch, noise[1], ent_coef)
+        # Compiled code can differentiate only what it computes itself
+        outputs = None if self.compile else batch.outputs(self.policy.actor)
+        metrics = self._step("critic", self._fit(batch, outputs, noise[0], ent_coef))
+        descent, log_prob, actor = self._climb(batch, outputs, noise[1], ent_coef)
         metrics |= self._step("actor", descent)
-        metrics |= self.ent_coef_dual.update(log_prob + float(self.target_entropy))
+        metrics |= self.ent_coef_dual.update(log_prob + float(self.target_entropy), batch.mask)
         if diagnose:
             metrics["ent_coef"] = self.ent_coef_dual.value
-            metrics["entropy"] = -log_prob.mean()
+            metrics["entropy"] = -masked_mean(log_prob, batch.mask)
             metrics |= {f"actor_{name}": value for name, value in actor.diagnostics().items()}
         return metrics
 
     @compilable
-    def _fit(self, batch: Batch, noise: th.Tensor, ent_coef: th.Tensor) -> Descent:
-        return self._critic_descent("critic", batch, self._target(batch, noise, ent_coef))
+    def _fit(self, batch: Batch, outputs: Outputs, noise: th.Tensor, ent_coef: th.Tensor) -> Descent:
+        return self._critic_descent("critic", batch, self._target(batch, outputs, noise, ent_coef))
 
     @th.no_grad()
-    def _target(self, batch: Batch, noise: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
-        actor = self.policy.actor(batch.next_observations)
-        next_q, log_prob = actor.expectation(partial(self.policy.critic_target, batch.next_observations), noise)
+    def _target(self, batch: Batch, outputs: Outputs, noise: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
+        _, later = outputs or batch.outputs(self.policy.actor)
+        next_q, log_prob = later.expectation(batch.values_after(self.policy.critic_target), noise)
         return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, ent_coef)
 
     @compilable
-    def _climb(self, batch: Batch, noise: th.Tensor, ent_coef: th.Tensor) -> tuple[Descent, th.Tensor, Distribution]:
-        """The actor's descent, its log-probability (B,) and its distribution, detached."""
-        actor = self.policy.actor(batch.observations)
-        q, log_prob = actor.expectation(partial(self.policy.critic, batch.observations), noise)
-        descent = self._descent("actor", learner_loss(0.0, q, 0.0, log_prob, ent_coef))
+    def _climb(
+        self, batch: Batch, outputs: Outputs, noise: th.Tensor, ent_coef: th.Tensor
+    ) -> tuple[Descent, th.Tensor, Distribution]:
+        """The actor's descent, its log-probability (\\*E) and its distribution, detached."""
+        actor = outputs[0] if outputs else self.policy.actor(batch.observations)
+        q, log_prob = actor.expectation(batch.values_at(self.policy.critic), noise)
+        descent = self._descent("actor", learner_loss(0.0, q, 0.0, log_prob, ent_coef, batch.mask))
         return descent, log_prob.detach(), actor.detach()

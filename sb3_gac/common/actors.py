@@ -30,6 +30,7 @@ class RolePolicy(RoleModel, BasePolicy):
     :param rest_extractor: encoder of the entries that the deployed policy does not read, if
         ``features_extractor`` is the deployed policy's and this is another role
     :param log_std_bounds: smallest and largest log standard deviation before tanh
+    :param memory: of the entries, for sequences; ``features_dim`` is then its output size
     """
 
     features_extractor: BaseFeaturesExtractor
@@ -46,6 +47,7 @@ class RolePolicy(RoleModel, BasePolicy):
         normalize_images: bool = True,
         rest_extractor: BaseFeaturesExtractor | None = None,
         log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
+        memory: nn.Module | None = None,
     ):
         super().__init__(
             observation_space,
@@ -55,6 +57,7 @@ class RolePolicy(RoleModel, BasePolicy):
             squash_output=isinstance(action_space, spaces.Box),
         )
         self.rest_extractor = rest_extractor
+        self.memory = memory
         self.net_arch = net_arch
         self.features_dim = features_dim
         self.activation_fn = activation_fn
@@ -64,18 +67,46 @@ class RolePolicy(RoleModel, BasePolicy):
         self.head = make_head(latent_dim, action_space, log_std_bounds)
 
     def forward(self, obs: PyTorchObs) -> Distribution:
+        r"""
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :return: of actions, or of what makes them, shapes (\*E, A)
         """
-        :param obs: observation with at least the entries of this role, B of each
-        :return: of actions, or of what makes them, shapes (B, A)
-        """
-        return self.head(self.latent(obs))
+        return self.output(self.latent(obs))
 
     def latent(self, obs: PyTorchObs) -> th.Tensor:
+        r"""
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :return: last hidden layer, shape (\*E, H)
         """
-        :param obs: observation with at least the entries of this role, B of each
-        :return: last hidden layer, shape (B, H)
+        features = self.extract_features(obs, self.features_extractor)
+        return self.latent_net(features if self.memory is None else self.memory(features)[0][0])
+
+    def output(self, latent: th.Tensor) -> Distribution:
+        r"""
+        :param latent: shape (\*E, H)
+        :return: see :meth:`forward`
         """
-        return self.latent_net(self.extract_features(obs, self.features_extractor))
+        return self.head(latent)
+
+    def remember(
+        self, obs: PyTorchObs, state: np.ndarray | None, episode_start: np.ndarray | None
+    ) -> tuple[Distribution, np.ndarray | None]:
+        """
+        One step of acting.
+
+        :param obs: observation with at least the entries of this role, (B, ...) of each
+        :param state: what was remembered before, shape (B, S), or ``None``
+        :param episode_start: true where an episode starts, shape (B,)
+        :return: as of :meth:`forward`, shapes (B, A), and what is remembered now; ``None`` without a memory
+        """
+        if self.memory is None:
+            return self(obs), None
+        assert isinstance(obs, dict)
+        one_step = {key: value[None] for key, value in obs.items()}
+        features = self.extract_features(one_step, self.features_extractor)
+        before = self.memory.state_before(state, episode_start, features.shape[1])  # type: ignore[operator]
+        outputs, after = self.memory(features, before)
+        return self.output(self.latent_net(outputs[0, 0])), after[0].cpu().numpy()
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {
@@ -85,6 +116,7 @@ class RolePolicy(RoleModel, BasePolicy):
             "activation_fn": self.activation_fn,
             "rest_extractor": self.rest_extractor,
             "log_std_bounds": self.log_std_bounds,
+            "memory": self.memory,
         }
 
 
@@ -112,6 +144,33 @@ class DeployedPolicy(RolePolicy):
             raise ValueError(f"The observation passed to predict() lacks {missing}, which the policy reads.")
         return {key: observation[key] for key in keys}
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        :param observation: see :meth:`obs_to_tensor`
+        :param state: what the last call returned, ``None`` at the start
+        :param episode_start: true where an episode starts, shape (B,)
+        :param deterministic: mode instead of a sample
+        :return: action in the environment's range, and the state for the next call
+        """
+        if self.memory is None:
+            return super().predict(observation, state, episode_start, deterministic)
+        self.set_training_mode(False)
+        obs, vectorized = self.obs_to_tensor(observation)
+        with th.no_grad():
+            actions, after = self.remember(obs, None if state is None else state[0], episode_start)
+        chosen = actions.mode if deterministic else actions.sample()
+        action = chosen.cpu().numpy().reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+        if isinstance(self.action_space, spaces.Box):
+            action = self.unscale_action(action)
+        assert after is not None
+        return (action if vectorized else action.squeeze(axis=0)), (after,)
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        actions = self(observation)
+        actions, _ = self.remember(observation, None, None)
         return actions.mode if deterministic else actions.sample()

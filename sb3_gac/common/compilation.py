@@ -52,8 +52,8 @@ class Program:
 
 def _tensors(value: Any) -> list[th.Tensor]:
     """Those in a structure, in pytree's order, at a tenth of its cost."""
-    if isinstance(value, th.Tensor):
-        return [value]
+    if value is None or isinstance(value, th.Tensor):
+        return [] if value is None else [value]
     return [tensor for part in (value.values() if isinstance(value, dict) else value) for tensor in _tensors(part)]
 
 

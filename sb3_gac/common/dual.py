@@ -21,7 +21,7 @@ class FixedCoefficient:
         self.optimizer: th.optim.Optimizer | None = None
         self.state_names: tuple[list[str], list[str]] = ([], ["value"])
 
-    def update(self, violation: th.Tensor) -> dict[str, th.Tensor]:
+    def update(self, violation: th.Tensor, mask: th.Tensor | None = None) -> dict[str, th.Tensor]:
         """Nothing to learn, and no loss."""
         return {}
 
@@ -60,16 +60,17 @@ class DualVariable:
         log_value = self.log_value.detach().squeeze(0)
         return ((log_value <= low) | (log_value >= high)).float()
 
-    def update(self, violation: th.Tensor) -> dict[str, th.Tensor]:
+    def update(self, violation: th.Tensor, mask: th.Tensor | None = None) -> dict[str, th.Tensor]:
         """
         One gradient step: up while the mean violation is positive, down while it is negative.
 
         :param violation: constraint violation per sample, shape (\\*E)
+        :param mask: shape (\\*E), 1 for valid samples; ``None`` if all are
         :return: loss to log, detached, scalar
         """
         assert self.optimizer is not None
         with th.no_grad():
-            loss = dual_loss(self.log_value, violation)
+            loss = dual_loss(self.log_value, violation, mask)
             self.log_value.grad = loss.view(1)  # d/dx (-exp(x) v) = -exp(x) v: the gradient is the loss itself
             self.optimizer.step()
             self.log_value.clamp_(*self._log_bounds)

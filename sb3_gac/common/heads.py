@@ -50,13 +50,16 @@ class GaussianHead(nn.Module):
         return list(self.log_std.parameters())
 
     @staticmethod
-    def deployment_losses(deployed: TanhGaussian, borrowing: TanhGaussian) -> dict[str, th.Tensor]:
+    def deployment_losses(
+        deployed: TanhGaussian, borrowing: TanhGaussian, mask: th.Tensor | None = None
+    ) -> dict[str, th.Tensor]:
         """
         :param deployed: the learner with its own standard deviation, shapes (\\*E, A)
         :param borrowing: with the guider's, as a constant, shapes (\\*E, A)
+        :param mask: shape (\\*E)
         :return: name -> scalar, what :meth:`deployment_parameters` are fitted with
         """
-        return {"log_std_loss": log_std_loss(deployed.log_std, borrowing.log_std)}
+        return {"log_std_loss": log_std_loss(deployed.log_std, borrowing.log_std, mask)}
 
     @th.no_grad()
     def shrink(self, factor: float) -> None:
@@ -92,7 +95,9 @@ class CategoricalHead(nn.Module):
         return []
 
     @staticmethod
-    def deployment_losses(deployed: Categorical, borrowing: Categorical) -> dict[str, th.Tensor]:
+    def deployment_losses(
+        deployed: Categorical, borrowing: Categorical, mask: th.Tensor | None = None
+    ) -> dict[str, th.Tensor]:
         """None."""
         return {}
 

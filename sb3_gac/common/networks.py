@@ -64,11 +64,15 @@ class RoleModel(BaseModel):
     """
     A network that reads only the observation entries of its role, whatever else the observation holds.
 
+    With a ``memory`` (:class:`sb3_gac.common.memory.Memory`) it takes sequences from an episode's start on, (T, B, ...) of
+    each entry instead of (B, ...).
+
     Where the learner's encoder is shared, ``features_extractor`` is the learner's, which the learner's loss alone
     trains, and ``rest_extractor`` encodes the entries that the learner does not read.
     """
 
     rest_extractor: BaseFeaturesExtractor | None
+    memory: nn.Module | None
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         """
@@ -87,7 +91,12 @@ class RoleModel(BaseModel):
         if isinstance(extractor, VectorExtractor):
             return extractor(obs)
         entries = {key: obs[key] for key in space.spaces}  # type: ignore[index]
-        return extractor(preprocess_obs(entries, space, normalize_images=self.normalize_images))
+        leading: list[int] = []
+        if self.memory is not None:  # encoders know one leading dimension, sequences have two
+            leading = list(next(iter(entries.values())).shape[:2])
+            entries = {key: value.flatten(0, 1) for key, value in entries.items()}
+        features = extractor(preprocess_obs(entries, space, normalize_images=self.normalize_images))
+        return features.unflatten(0, leading) if leading else features
 
 
 class Head(nn.Linear):
@@ -147,13 +156,12 @@ class EnsembleInput(nn.Module):
 
     def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        :param features: shape (B, F)
+        :param features: shape (N, B, F)
         :param actions: shape (B, A)
         :return: shape (N, B, H)
         """
-        n_members = len(self.bias)
-        x = th.bmm(features.expand(n_members, *features.shape), self.features_weight)
-        return th.baddbmm(x, actions.expand(n_members, *actions.shape), self.actions_weight) + self.bias
+        x = th.bmm(features, self.features_weight)
+        return th.baddbmm(x, actions.expand(len(features), *actions.shape), self.actions_weight) + self.bias
 
 
 class EnsembleOutput(nn.Module):
@@ -192,6 +200,7 @@ class CriticEnsemble(RoleModel):
     :param rest_extractor: encoder of the entries that the learner does not read, if ``features_extractor`` is the
         learner's
     :param n_critics: size of the ensemble, N
+    :param memory: of the entries, for sequences; ``features_dim`` is then its output size. Actions join after it
     """
 
     features_extractor: BaseFeaturesExtractor
@@ -207,11 +216,13 @@ class CriticEnsemble(RoleModel):
         normalize_images: bool = True,
         rest_extractor: BaseFeaturesExtractor | None = None,
         n_critics: int = 2,
+        memory: nn.Module | None = None,
     ):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
         self.rest_extractor = rest_extractor
+        self.memory = memory
         self.net_arch = net_arch
         self.features_dim = features_dim
         self.activation_fn = activation_fn
@@ -230,16 +241,45 @@ class CriticEnsemble(RoleModel):
             self.input = EnsembleInput(self.n_critics, features_dim, action_dim, self.net_arch[0])
         self.output: nn.Module = EnsembleOutput(self.n_critics, [features_dim + action_dim, *self.net_arch][-1])
 
-    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+    def forward(self, obs: PyTorchObs, actions: th.Tensor | None) -> th.Tensor:
+        r"""
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :param actions: in [-1, 1], shape (\*E, A)
+        :return: shape (N, \*E)
         """
-        :param obs: observation with at least the entries of this role, B of each
-        :param actions: in [-1, 1], shape (B, A)
-        :return: shape (N, B)
+        return self.values(self.encode(obs), actions)
+
+    def encode(self, obs: PyTorchObs) -> th.Tensor:
+        r"""
+        What is needed of the observations, whatever the actions.
+
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :return: shape (B, F), or with a memory (N, T, B, F)
         """
         features = self.extract_features(obs, self.features_extractor)
+        return features if self.memory is None else self.memory(features)[0]
+
+    def values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
+        """
+        :param features: of :meth:`encode`
+        :param actions: see :meth:`forward`
+        :return: see :meth:`forward`
+        """
+        if self.memory is None:
+            return self._values(features.expand(self.n_critics, *features.shape), actions)
+        assert actions is None or actions.dim() == 3
+        flat_actions = None if actions is None else actions.flatten(0, 1)
+        return self._values(features.flatten(1, 2), flat_actions).unflatten(1, features.shape[1:3])
+
+    def _values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
+        """
+        :param features: shape (N, B, F)
+        :param actions: shape (B, A)
+        :return: shape (N, B)
+        """
+        assert actions is not None
         if self.input is None:
-            x = th.cat([features, actions], dim=-1)
-            return self.output(x.expand(self.n_critics, *x.shape))
+            return self.output(th.cat([features, actions.expand(self.n_critics, *actions.shape)], dim=-1))
         return self.output(self.hidden(self.input(features, actions)))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -250,6 +290,7 @@ class CriticEnsemble(RoleModel):
             "activation_fn": self.activation_fn,
             "rest_extractor": self.rest_extractor,
             "n_critics": self.n_critics,
+            "memory": self.memory,
         }
 
 
@@ -267,14 +308,14 @@ class DiscreteCriticEnsemble(CriticEnsemble):
         self.output = EnsembleLinear(self.n_critics, widths[-1], n_actions)
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor:
+        r"""
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :param actions: numbers of actions, shape (\*E, 1); ``None`` for all
+        :return: shape (N, \*E), or (N, \*E, A) of all actions
         """
-        :param obs: observation with at least the entries of this role, B of each
-        :param actions: numbers of actions, shape (B, 1); ``None`` for all
-        :return: shape (N, B), or (N, B, A) of all actions
-        """
-        x = self.extract_features(obs, self.features_extractor)
-        x = x.expand(self.n_critics, *x.shape)
-        if self.input is not None:
-            x = self.hidden(self.input(x))
+        return super().forward(obs, actions)
+
+    def _values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
+        x = features if self.input is None else self.hidden(self.input(features))
         q = self.output(x)
         return q if actions is None else q.gather(-1, actions.long().expand(self.n_critics, *actions.shape)).squeeze(-1)

@@ -19,9 +19,10 @@ from sb3_gac.common.checks import (
     check_terminal_observations,
 )
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
+from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_sequences
 from sb3_gac.common.heads import check_action_space, resolve_target_entropy
 from sb3_gac.common.parallel import has_side_effects
-from sb3_gac.common.policies import AsymmetricPolicy
+from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
 from sb3_gac.common.roles import RoleKeys, resolve_lr_scales, resolve_role_keys
 from sb3_gac.common.training import NetworkTraining
 
@@ -159,7 +160,7 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
     def _setup_model(self) -> None:
         self._check_arguments()
         if self.replay_buffer_class is None:
-            self.replay_buffer_class = CompactDictReplayBuffer
+            self.replay_buffer_class = CompactDictReplayBuffer if self.policy_class.cell is None else EpisodeReplayBuffer
         as_given = {name: getattr(self, name) for name in ("policy_kwargs", "replay_buffer_kwargs", "n_steps")}
         self.policy_kwargs = {**self._policy_options(), **self.policy_kwargs}
         if issubclass(self.replay_buffer_class, CompactDictReplayBuffer):
@@ -176,6 +177,7 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
             raise ValueError("compile=True can't do dropout or batch normalisation: leave them out, or leave it False.")
         self._setup_coefficients()
         self.programs = {}
+        self._behaviour_state: BehaviourState = None
 
     def _check_arguments(self) -> None:
         """
@@ -186,6 +188,8 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
             raise ValueError("action_noise can be added to Box actions only: leave it out.")
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
+        if self.policy_class.cell is not None:
+            check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
         if self.replay_buffer_class in (ReplayBuffer, NStepReplayBuffer):
             raise ValueError(
                 f"replay_buffer_class={self.replay_buffer_class.__name__} can't hold Dict observations: "
@@ -255,10 +259,15 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         :param n_envs: number of environments
         :return: action for the environments, and the same scaled to [-1, 1] for the buffer
         """
-        if self.num_timesteps < learning_starts:
+        warms_up = self.num_timesteps < learning_starts
+        if warms_up and self.policy.cell is None:
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, dict)
-        scaled_action, _ = self.policy.behaviour_action(self._last_obs)
+        scaled_action, self._behaviour_state = self.policy.behaviour_action(
+            self._last_obs, self._behaviour_state, self._last_episode_starts
+        )
+        if warms_up:  # the memory was brought up
+            return super()._sample_action(learning_starts, action_noise, n_envs)
         if action_noise is not None:
             scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
         return self._in_environments_range(scaled_action), scaled_action
@@ -296,6 +305,7 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         self._forget_episode_on_error(check_finite_observation, {"reward": reward}, what="The environment's")
         self._forget_episode_on_error(check_terminal_observations, dones, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._last_episode_starts = dones
 
     def _forget_episode_on_error(self, check: Any, *args: Any, **kwargs: Any) -> None:
         """A refused observation ends the episode: the next ``learn()`` resets the environment and keeps the rest."""

@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import torch as th
@@ -15,9 +15,14 @@ from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy
+from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.flat import FlatParameters
+from sb3_gac.common.memory import Memory
 from sb3_gac.common.networks import CriticEnsemble, DiscreteCriticEnsemble, VectorExtractor, polyak_average, trainable
 from sb3_gac.common.roles import RoleKeys, Roles, resolve_lr_scales, resolve_net_arch, resolve_role_keys, role_space
+
+#: What each network of a behaviour policy remembers, shapes (B, S); ``None`` without memories, and before the first step
+BehaviourState: TypeAlias = tuple[np.ndarray, ...] | None
 
 
 class AsymmetricPolicy(BasePolicy):
@@ -42,9 +47,13 @@ class AsymmetricPolicy(BasePolicy):
     :param normalize_images: divide images by 255
     :param optimizer_class: optimiser of policies and critics
     :param optimizer_kwargs: keyword arguments for it, without the learning rate
+    :param rnn_hidden_size: of recurrent policies: size of each network's recurrent layer, which comes after ``net_arch``
+    :param rnn_net_arch: of recurrent policies: hidden layer sizes after the recurrent layer
     """
 
     roles: ClassVar[Roles]
+    #: "gru" or "lstm" for networks that remember, and then take sequences
+    cell: ClassVar[str | None] = None
 
     def __init__(
         self,
@@ -61,6 +70,8 @@ class AsymmetricPolicy(BasePolicy):
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
+        rnn_hidden_size: int = 256,
+        rnn_net_arch: Sequence[int] = (256,),
     ):
         super().__init__(
             observation_space,
@@ -79,6 +90,8 @@ class AsymmetricPolicy(BasePolicy):
             "lr_scales": lr_scales,
             "n_critics": n_critics,
             "share_features_extractor": share_features_extractor,
+            "rnn_hidden_size": rnn_hidden_size,
+            "rnn_net_arch": list(rnn_net_arch),
         }
         self.net_arch = net_arch
         self.n_critics = n_critics
@@ -104,13 +117,22 @@ class AsymmetricPolicy(BasePolicy):
         return {
             "observation_space": role_space(self.observation_space, self.role_keys[role]),  # type: ignore[arg-type]
             "action_space": self.action_space,
-            "net_arch": self._role_net_arch[role],
             "features_extractor": features_extractor,
             "rest_extractor": rest_extractor,
-            "features_dim": sum(extractor.features_dim for extractor in extractors),
             "activation_fn": self.constructor_options["activation_fn"],
             "normalize_images": self.normalize_images,
+            **self._body_kwargs(role, sum(extractor.features_dim for extractor in extractors)),
         }
+
+    def _body_kwargs(self, role: str, features_dim: int) -> dict[str, Any]:
+        """What comes after a role's encoder: hidden layers, after a memory where policies are recurrent."""
+        net_arch, options = self._role_net_arch[role], self.constructor_options
+        if self.cell is None:
+            return {"features_dim": features_dim, "net_arch": net_arch}
+        hidden_size = options["rnn_hidden_size"]
+        members = self.n_critics if role in self.roles.critics else 1
+        memory = Memory(self.cell, features_dim, net_arch, hidden_size, options["activation_fn"], members)
+        return {"memory": memory, "features_dim": hidden_size, "net_arch": options["rnn_net_arch"]}
 
     def _make_extractor(self, keys: Sequence[str]) -> BaseFeaturesExtractor:
         space = role_space(self.observation_space, keys)  # type: ignore[arg-type]
@@ -210,14 +232,31 @@ class AsymmetricPolicy(BasePolicy):
         return not self.share_features_extractor
 
     @abstractmethod
-    def behaviour_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
-        """
+    def behaviour_action(
+        self,
+        observation: dict[str, np.ndarray],
+        state: BehaviourState = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, BehaviourState]:
+        r"""
         Action of the policy that collects the data, in [-1, 1] or one of a number.
 
-        :param observation: full observation, single or batched
+        :param observation: full observation, B of each entry
+        :param state: what the last call returned, ``None`` at the start
+        :param episode_start: true where an episode starts, shape (B,)
         :param deterministic: mode instead of a sample
-        :return: shape (B, \\*action shape), and whether the observation was batched
+        :return: shape (B, \*action shape), and what recurrent policies remember
         """
+
+    def _chosen(self, actions: Distribution, deterministic: bool) -> np.ndarray:
+        r"""
+        :param actions: shapes (B, A)
+        :param deterministic: mode instead of a sample
+        :return: shape (B, \*action shape)
+        """
+        chosen = actions.mode if deterministic else actions.sample()
+        return chosen.cpu().numpy().reshape(-1, *self.action_space.shape)  # type: ignore[misc]
 
     def predict(
         self,
@@ -230,10 +269,10 @@ class AsymmetricPolicy(BasePolicy):
         The deployed policy's action; entries that it does not read are ignored.
 
         :param observation: single or batched; ``{"partial": ...}``, a full dict, or the partial entry alone
-        :param state: passed through
-        :param episode_start: ignored
+        :param state: what a recurrent policy's last call returned, ``None`` at the start
+        :param episode_start: true where an episode starts, shape (B,)
         :param deterministic: mode instead of a sample
-        :return: action in the environment's range, and ``state``
+        :return: action in the environment's range, and the state for the next call
         """
         return self.deployed.predict(observation, state, episode_start, deterministic)
 

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
@@ -9,7 +10,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.common.compilation import Program
-from sb3_gac.common.losses import critic_loss
+from sb3_gac.common.episodes import SequenceSamples
+from sb3_gac.common.losses import critic_loss, masked_mean
 from sb3_gac.common.parallel import halved_threads, run_halves
 from sb3_gac.common.policies import AsymmetricPolicy
 
@@ -17,15 +19,17 @@ Metrics = dict[str, th.Tensor]
 
 
 class Batch(NamedTuple):
-    """
-    A batch of transitions.
+    r"""
+    A batch of transitions, ``*E`` = (B,), or of sequences of them from episodes' starts on, ``*E`` = (T, B).
 
-    :param observations: dict of entries, B of each
-    :param actions: in [-1, 1], shape (B, A)
-    :param rewards: shape (B,)
-    :param next_observations: dict of entries, B of each
-    :param dones: 1 where the episode terminated, 0 where it went on or ran into its time limit, shape (B,)
-    :param discounts: gamma to the number of steps that the reward sums up, scalar or shape (B,)
+    :param observations: dict of entries, (\*E, ...) of each
+    :param actions: in [-1, 1], shape (\*E, A), or numbers of actions, shape (\*E, 1)
+    :param rewards: shape (\*E)
+    :param next_observations: dict of entries, (\*E, ...) of each
+    :param dones: 1 where the episode terminated, 0 where it went on or ran into its time limit, shape (\*E)
+    :param discounts: gamma to the number of steps that the reward sums up, scalar or shape (\*E)
+    :param sequence: of sequences, observations and the last next one together, (T + 1, B, ...) of each entry
+    :param mask: of sequences, 1 for what counts, 0 for padding and for what only brings memories up, shape (T, B)
     """
 
     observations: PyTorchObs
@@ -34,6 +38,38 @@ class Batch(NamedTuple):
     next_observations: PyTorchObs
     dones: th.Tensor
     discounts: th.Tensor
+    sequence: PyTorchObs | None = None
+    mask: th.Tensor | None = None
+
+    def outputs(self, policy: Callable[[Any], Any]) -> tuple[Any, Any]:
+        """
+        :param policy: observations -> distribution
+        :return: on the observations, and, as a constant, on the next ones; of sequences in one pass over time
+        """
+        if self.sequence is None:
+            now = policy(self.observations)
+            with th.no_grad():
+                return now, policy(self.next_observations)
+        both = policy(self.sequence)
+        return type(both)(*(part[:-1] for part in both)), type(both)(*(part[1:].detach() for part in both))
+
+    @th.no_grad()
+    def values_at(self, critic: Any) -> Callable[[Any], th.Tensor]:
+        """
+        :param critic: an ensemble, frozen
+        :return: actions at the observations -> values, differentiable by the actions
+        """
+        return partial(critic.values, critic.encode(self.observations))
+
+    @th.no_grad()
+    def values_after(self, critic: Any) -> Callable[[Any], th.Tensor]:
+        """
+        :param critic: an ensemble, frozen
+        :return: actions at the next observations -> values
+        """
+        if self.sequence is None:
+            return partial(critic.values, critic.encode(self.next_observations))
+        return partial(critic.values, critic.encode(self.sequence)[:, 1:])
 
 
 class Descent(NamedTuple):
@@ -118,8 +154,8 @@ class NetworkTraining(OffPolicyAlgorithm):
         :return: with loss, mean Q and gradient norm, named after the ensemble
         """
         q = getattr(self.policy, name)(batch.observations, batch.actions)
-        gradient, metrics = self._descent(name, critic_loss(q, target))
-        return Descent(gradient, {f"{name}_q": q.detach().mean()} | metrics)
+        gradient, metrics = self._descent(name, critic_loss(q, target, batch.mask))
+        return Descent(gradient, {f"{name}_q": masked_mean(q.detach().mean(dim=0), batch.mask)} | metrics)
 
     def _step(self, name: str, descent: Descent) -> Metrics:
         """
@@ -146,13 +182,21 @@ class NetworkTraining(OffPolicyAlgorithm):
     def _sample_batch(self, batch_size: int) -> Batch:
         assert self.replay_buffer is not None
         samples = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+        discounts = getattr(samples, "discounts", None)
+        if discounts is None:
+            discounts = th.full((), self.gamma, device=self.device)
+        if isinstance(samples, SequenceSamples):
+            now = {key: entry[:-1] for key, entry in samples.observations.items()}
+            later = {key: entry[1:] for key, entry in samples.observations.items()}
+            what_happened = (samples.actions, samples.rewards, later, samples.dones)
+            return Batch(now, *what_happened, discounts, samples.observations, samples.mask)
         return Batch(
             samples.observations,
             samples.actions,
             samples.rewards.flatten(),
             samples.next_observations,
             samples.dones.flatten(),
-            th.full((), self.gamma, device=self.device) if samples.discounts is None else samples.discounts.flatten(),
+            discounts.flatten() if discounts.dim() else discounts,
         )
 
     @abstractmethod

@@ -23,7 +23,7 @@ _NOISE_BLOCK = 128  # drawn at once: one by one takes several times as long
 _NOISE_STREAM = 0x6E6F697365  # keeps the noise apart from generators that others seed with the same number
 
 
-def _reset(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
+def reset_with(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
     """Reset with those keywords that were given: not every environment knows both."""
     given: dict[str, Any] = {name: value for name, value in {"seed": seed, "options": options}.items() if value is not None}
     return env.reset(**given)
@@ -38,7 +38,7 @@ class _SplitWrapper(gym.ObservationWrapper):
         :param options: of the environment
         :return: ``partial`` and ``privileged``, info
         """
-        observation, info = _reset(self.env, seed, options)
+        observation, info = reset_with(self.env, seed, options)
         return self.observation(observation), info
 
 
@@ -131,7 +131,7 @@ class _EntryWrapper(gym.Wrapper):
         :param options: of the environment
         :return: changed observation, info
         """
-        observation, info = _reset(self.env, seed, options)
+        observation, info = reset_with(self.env, seed, options)
         return {**observation, self._key: self._first(observation[self._key], seed)}, info
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
@@ -249,6 +249,51 @@ class History(_EntryWrapper):
     def _joined(self) -> np.ndarray:
         parts = [*self._values, *self._actions] if self._no_action.size else list(self._values)
         return np.concatenate(parts, dtype=self._entry.dtype)
+
+
+class PreviousAction(_EntryWrapper):
+    """
+    Append the previous action to one entry, one-hot where it is one of a number; and, on request, the previous reward.
+
+    Zeros at reset.  Policies that remember need it where the dynamics depend on their actions.
+
+    :param env: with a Dict observation
+    :param reward: whether to append the previous reward as well
+    :param key: the entry
+    :raises ValueError: if the entry is not a floating-point vector, or the actions are neither Box nor Discrete
+    """
+
+    def __init__(self, env: gym.Env, reward: bool = False, key: str = PARTIAL):
+        super().__init__(env, key)
+        if not (len(self._entry.shape) == 1 and np.issubdtype(self._entry.dtype, np.floating)):
+            raise ValueError(f'PreviousAction needs a one-dimensional, floating-point entry "{key}", not {self._entry}.')
+        if not isinstance(env.action_space, (spaces.Box, spaces.Discrete)):
+            raise ValueError(f"PreviousAction needs Box or Discrete actions, but the environment has {env.action_space}.")
+        self._reward = reward
+        dtype = self._entry.dtype
+        self._nothing = np.zeros(spaces.flatdim(env.action_space) + reward, dtype=dtype)
+        # A policy may hand in actions outside a Box, which many environments clip
+        bound = 1.0 if isinstance(env.action_space, spaces.Discrete) and not reward else np.inf
+        low = 0.0 if bound == 1.0 else -np.inf
+        added = spaces.Box(low, bound, self._nothing.shape, dtype)
+        self._set_entry_space(concatenate_boxes([self._entry, added]))
+
+    def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
+        return np.concatenate([value, self._nothing], dtype=self._entry.dtype)
+
+    def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
+        """
+        :param action: of the environment
+        :return: changed observation, reward, terminated, truncated, info
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if isinstance(self.action_space, spaces.Discrete):
+            taken = np.eye(int(self.action_space.n))[int(action) - int(self.action_space.start)]
+        else:
+            taken = np.ravel(action)
+        parts = [observation[self._key], taken, [reward]] if self._reward else [observation[self._key], taken]
+        changed = {**observation, self._key: np.concatenate(parts, dtype=self._entry.dtype, casting="unsafe")}
+        return changed, reward, terminated, truncated, info
 
 
 class FlattenMultiDiscrete(gym.ActionWrapper):

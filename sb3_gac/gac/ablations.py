@@ -21,4 +21,4 @@ class GACWithoutQ(GACShare):
     """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14)."""
 
     def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
-        return distillation_loss(now.guider.detach().kl(now.learner, self.kl_reduction))
+        return distillation_loss(now.guider.detach().kl(now.learner, self.kl_reduction), inputs.batch.mask)

@@ -19,12 +19,12 @@ class Learner(DeployedPolicy):
     ``predict(deterministic=False)`` where there is no guider.
     """
 
-    def forward(self, obs: PyTorchObs) -> Distribution:
+    def output(self, latent: th.Tensor) -> Distribution:
+        r"""
+        :param latent: shape (\*E, H)
+        :return: at deployment; the gradient of a std stops at its own layer; shapes (\*E, A)
         """
-        :param obs: observation with at least the learner's entries, B of each
-        :return: at deployment; the gradient of a std stops at its own layer; shapes (B, A)
-        """
-        return self.head(self.latent(obs), detach_std=True)
+        return self.head(latent, detach_std=True)
 
 
 class Guider(RolePolicy):

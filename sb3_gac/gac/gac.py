@@ -17,7 +17,7 @@ from sb3_gac.common.distributions import KL_REDUCTIONS
 from sb3_gac.common.dual import make_coefficient
 from sb3_gac.common.roles import RoleKeys
 from sb3_gac.gac.actors import GUIDERS
-from sb3_gac.gac.policies import GACPolicy, MultiInputPolicy
+from sb3_gac.gac.policies import GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
 from sb3_gac.gac.update import GuidedUpdate
 
 KL_COEF_START = 1.0
@@ -44,7 +44,11 @@ class GAC(GuidedUpdate):
         into saturation; False for eqs. 15 and 16 as printed
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MultiInputPolicy": MultiInputPolicy,
+        "MultiInputGruPolicy": GACGruPolicy,
+        "MultiInputLstmPolicy": GACLstmPolicy,
+    }
 
     def __init__(
         self,
@@ -176,13 +180,14 @@ class GAC(GuidedUpdate):
         The guider's action; needs the full observation. Arguments and result are those of ``predict``.
 
         :param observation: single or batched
-        :param state: passed through
-        :param episode_start: ignored
+        :param state: what a recurrent guider's last call returned, ``None`` at the start
+        :param episode_start: true where an episode starts, shape (B,)
         :param deterministic: mode instead of a sample
-        :return: action in the environment's range, and ``state``
+        :return: action in the environment's range, and the state for the next call
         """
         self.policy.set_training_mode(False)
-        scaled_action, vectorized = self.policy.behaviour_action(observation, deterministic)
+        _, vectorized = self.policy.obs_to_tensor(observation)
+        scaled_action, state = self.policy.behaviour_action(observation, state, episode_start, deterministic)
         action = self._in_environments_range(scaled_action)
         return (action if vectorized else action.squeeze(axis=0)), state
 

@@ -11,7 +11,7 @@ from torch import nn
 from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.heads import LOG_STD_BOUNDS
 from sb3_gac.common.networks import CriticEnsemble
-from sb3_gac.common.policies import AsymmetricPolicy
+from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
 from sb3_gac.common.roles import Roles
 from sb3_gac.gac.actors import GUIDERS, Learner
 
@@ -131,19 +131,33 @@ class GACPolicy(AsymmetricPolicy):
         guider = self.guider.relative_to(learner_output, guider_output)
         return ActionDistributions(guider, learner_output.borrowing(guider), learner_output)  # type: ignore[arg-type]
 
-    def behaviour_action(self, observation: dict[str, np.ndarray], deterministic: bool = False) -> tuple[np.ndarray, bool]:
-        """
-        Action of the guider, in [-1, 1] or one of a number.
-
-        :param observation: full observation, single or batched
-        :param deterministic: mode instead of a sample
-        :return: shape (B, \\*action shape), and whether the observation was batched
-        """
-        obs, vectorized = self.obs_to_tensor(observation)
+    def behaviour_action(
+        self,
+        observation: dict[str, np.ndarray],
+        state: BehaviourState = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, BehaviourState]:
+        """The guider's, see :meth:`AsymmetricPolicy.behaviour_action`; remembered are the learner's state and its own."""
+        obs, _ = self.obs_to_tensor(observation)
+        of_learner, of_guider = state or (None, None)
         with th.no_grad():
-            guider = self.distributions(obs).guider
-            action = guider.mode if deterministic else guider.sample()
-        return action.cpu().numpy().reshape(-1, *self.action_space.shape), vectorized  # type: ignore[misc]
+            learner, of_learner = self.learner.remember(obs, of_learner, episode_start)
+            guider, of_guider = self.guider.remember(obs, of_guider, episode_start)
+            action = self._chosen(self.combine(guider, learner).guider, deterministic)
+        return action, None if of_learner is None or of_guider is None else (of_learner, of_guider)
+
+
+class GACGruPolicy(GACPolicy):
+    """All networks with a GRU each."""
+
+    cell = "gru"
+
+
+class GACLstmPolicy(GACPolicy):
+    """All networks with an LSTM each."""
+
+    cell = "lstm"
 
 
 MultiInputPolicy = GACPolicy

@@ -1,7 +1,6 @@
 """One gradient step of Guided Actor-Critic: Algorithm 1."""
 
 import math
-from functools import partial
 from typing import NamedTuple
 
 import torch as th
@@ -10,7 +9,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from sb3_gac.common.compilation import compilable
 from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.dual import Coefficient
-from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target
+from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target, masked_mean
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.common.training import Batch, Descent, Metrics
 from sb3_gac.gac.policies import ActionDistributions, GACPolicy
@@ -20,7 +19,7 @@ class StepInputs(NamedTuple):
     """
     What both halves of a gradient step read and neither changes.
 
-    :param batch: B transitions
+    :param batch: of transitions, \\*E = (B,), or of sequences, \\*E = (T, B)
     :param guider: what its network computes on the observations
     :param learner: the same
     :param later: what both networks compute on the next observations, as constants
@@ -64,9 +63,9 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
             [lambda: self._guider_half(inputs, noise[:2]), lambda: self._learner_half(inputs, noise[2:])]
         )
         metrics = guider_metrics | learner_metrics
-        metrics |= self.ent_coef_dual.update(log_prob + float(self.target_entropy))
-        metrics |= self.kl_coef_dual.update(kl - self.current_target_kl)
-        metrics["kl"] = kl.mean()
+        metrics |= self.ent_coef_dual.update(log_prob + float(self.target_entropy), batch.mask)
+        metrics |= self.kl_coef_dual.update(kl - self.current_target_kl, batch.mask)
+        metrics["kl"] = masked_mean(kl, batch.mask)
         return metrics | self._diagnostics(inputs, kl, log_prob) if diagnose else metrics
 
     @property
@@ -85,10 +84,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     @compilable
     def _on_both(self, name: str, batch: Batch) -> tuple[Distribution, Distribution]:
         """A policy's outputs on the observations, and, as constants, on the next ones."""
-        network = getattr(self.policy, name)
-        now = network(batch.observations)
-        with th.no_grad():
-            return now, network(batch.next_observations)
+        return batch.outputs(getattr(self.policy, name))
 
     def _outputs(self, name: str, inputs: StepInputs) -> Distribution:
         """What a policy computes on the observations; compiled code can differentiate only what it computes itself."""
@@ -101,8 +97,8 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         Eqs. 12 and 13.
 
         :param inputs: of this step
-        :param noise: standard normal, for the next action and for the present one, shape (2, B, A)
-        :return: metrics; KL(guider || learner) and the guider's log-probability, detached, each of shape (B,)
+        :param noise: standard normal, for the next action and for the present one, shape (2, \\*E, A)
+        :return: metrics; KL(guider || learner) and the guider's log-probability, detached, each of shape (\\*E)
         """
         metrics = self._step("guider_critic", self._guider_critic_descent(inputs, noise[0]))
         descent, kl, log_prob = self._guider_descent(inputs, noise[1])
@@ -114,18 +110,18 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
 
     @compilable
     def _guider_descent(self, inputs: StepInputs, noise: th.Tensor) -> tuple[Descent, th.Tensor, th.Tensor]:
-        """Eq. 13; with KL(guider || learner) and the guider's log-probability, detached, each of shape (B,)."""
+        """Eq. 13; with KL(guider || learner) and the guider's log-probability, detached, each of shape (\\*E)."""
         now = self.policy.combine(self._outputs("guider", inputs), inputs.learner)
-        q, log_prob = now.guider.expectation(partial(self.policy.guider_critic, inputs.batch.observations), noise)
+        q, log_prob = now.guider.expectation(inputs.batch.values_at(self.policy.guider_critic), noise)
         kl = now.guider.kl(now.learner.detach(), self.kl_reduction)
-        loss = guider_loss(kl, log_prob, q, inputs.kl_coef, inputs.ent_coef)
+        loss = guider_loss(kl, log_prob, q, inputs.kl_coef, inputs.ent_coef, inputs.batch.mask)
         return self._descent("guider", loss), kl.detach(), log_prob.detach()
 
     @th.no_grad()
     def _guided_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
-        """Eq. 12, shape (B,)."""
+        """Eq. 12, shape (\\*E)."""
         batch, later = inputs.batch, self.policy.combine(*inputs.later)
-        next_q, log_prob = later.guider.expectation(partial(self.policy.guider_critic_target, batch.next_observations), noise)
+        next_q, log_prob = later.guider.expectation(batch.values_after(self.policy.guider_critic_target), noise)
         next_kl = later.guider.kl(later.learner, self.kl_reduction)
         coefficients = (inputs.kl_coef, inputs.ent_coef)
         return guided_target(batch.rewards, batch.dones, next_q, next_kl, log_prob, *coefficients, batch.discounts)
@@ -137,7 +133,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         Eqs. 15 and 16, and the fit of the std for deployment.
 
         :param inputs: of this step
-        :param noise: standard normal, for the next action and for the present one, shape (2, B, A)
+        :param noise: standard normal, for the next action and for the present one, shape (2, \\*E, A)
         :return: metrics
         """
         metrics: Metrics = {}
@@ -152,16 +148,16 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     @compilable
     def _learner_descent(self, inputs: StepInputs, noise: th.Tensor) -> Descent:
         now = self.policy.combine(inputs.guider, self._outputs("learner", inputs))
-        losses = self.policy.learner.head.deployment_losses(now.deployed, now.learner)
+        losses = self.policy.learner.head.deployment_losses(now.deployed, now.learner, inputs.batch.mask)
         gradient, metrics = self._descent("learner", self._learner_loss(inputs, now, noise), sum(losses.values()))
         return Descent(gradient, metrics | {name: loss.detach() for name, loss in losses.items()})
 
     @th.no_grad()
     def _learner_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
-        """Eq. 15, shape (B,)."""
+        """Eq. 15, shape (\\*E)."""
         batch = inputs.batch
         learner = self.policy.combine(*inputs.later).learner
-        next_q, log_prob = learner.expectation(partial(self.policy.critic_target, batch.next_observations), noise)
+        next_q, log_prob = learner.expectation(batch.values_after(self.policy.critic_target), noise)
         return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, self._learner_ent_coef(inputs))
 
     def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
@@ -170,27 +166,29 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
 
         :param inputs: of this step
         :param now: the policies on the observations, with the learner's gradients
-        :param noise: standard normal, shape (B, A)
+        :param noise: standard normal, shape (\\*E, A)
         :return: scalar
         """
-        q, log_prob = now.learner.expectation(partial(self.policy.critic, inputs.batch.observations), noise)
+        q, log_prob = now.learner.expectation(inputs.batch.values_at(self.policy.critic), noise)
         kl: th.Tensor | float = 0.0
         if self.learner_kl_scale:
             kl = float(self.learner_kl_scale) * now.guider.detach().kl(now.learner, self.kl_reduction)
-        return learner_loss(kl, q, inputs.kl_coef, log_prob, self._learner_ent_coef(inputs))
+        return learner_loss(kl, q, inputs.kl_coef, log_prob, self._learner_ent_coef(inputs), inputs.batch.mask)
 
     def _learner_ent_coef(self, inputs: StepInputs) -> th.Tensor | float:
         return inputs.ent_coef if self.learner_entropy else 0.0
 
     def _diagnostics(self, inputs: StepInputs, kl: th.Tensor, log_prob: th.Tensor) -> Metrics:
-        target, learner = self.current_target_kl, self.policy.combine(inputs.guider, inputs.learner).learner
+        target, mask = self.current_target_kl, inputs.batch.mask
+        counted = kl.flatten() if mask is None else kl[mask > 0]
+        learner = self.policy.combine(inputs.guider, inputs.learner).learner
         return {
-            "kl_p95": kl.kthvalue(math.ceil(0.95 * kl.numel())).values,
-            "kl_above_target": (kl > target).float().mean(),
+            "kl_p95": counted.kthvalue(math.ceil(0.95 * counted.numel())).values,
+            "kl_above_target": (counted > target).float().mean(),
             "target_kl": kl.new_full((), target),
             "kl_coef": self.kl_coef_dual.value,
             "kl_coef_on_bound": self.kl_coef_dual.on_bound(),
             "ent_coef": self.ent_coef_dual.value,
-            "entropy": -log_prob.mean(),
+            "entropy": -masked_mean(log_prob, mask),
             **{f"learner_{name}": value for name, value in learner.diagnostics().items()},
         }

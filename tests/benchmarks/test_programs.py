@@ -20,7 +20,7 @@ from benchmarks.aggregate import compare, finished_runs, summarise_cells
 from benchmarks.checkpoint import locked
 from benchmarks.config import instantiate, read_algorithm, resolve
 from benchmarks.launch import jobs_left
-from benchmarks.run import run
+from benchmarks.run import environment, run
 from benchmarks.suite import RunSpec, read_preset, read_suite
 from sb3_gac import GAC, preset
 
@@ -222,6 +222,28 @@ def test_the_papers_preset_has_the_papers_values(task, noise, target_kl):
     assert set(arguments) - set(of_sac) == {"guider", "learner_entropy", "target_kl"}
 
 
+def test_table_4_has_the_papers_values():
+    spec = RunSpec("gac", "popgym-RepeatPreviousEasy", 0.0, 0, 10**7, 1, "paper-popgym", 1, 1)
+    _, arguments = resolve(spec)
+    assert (arguments["policy"], arguments["batch_size"], arguments["target_kl"]) == ("MultiInputGruPolicy", 32, 0.05)
+    env_id, env_kwargs = environment(spec)
+    model = GAC(env=gym.make(env_id, **env_kwargs), **{**instantiate(arguments), "buffer_size": 1_000, "device": "cpu"})
+    assert model.target_entropy == pytest.approx(0.9 * np.log(4))
+    for network in (model.policy.guider, model.policy.learner, model.policy.guider_critic):
+        layers = [layer.weight.shape[-1] for layer in network.memory.hidden if hasattr(layer, "weight")]
+        assert (layers, network.memory.hidden_size, network.net_arch) == ([256, 256], 256, [256])
+
+
+def test_tasks_without_sensor_noise_have_none():
+    spec = RunSpec("gac", "popgym-BattleshipEasy", 0.0, 0, 1, 1, "small-memory", 1, 1)
+    assert environment(spec) == ("sb3_gac/popgym-BattleshipEasy-v0", {})
+    assert environment(replace(spec, task="Ant", noise=0.2)) == ("sb3_gac/Ant-v5", {"noise_std": 0.2})
+    with pytest.raises(ValueError, match="has no sensor noise"):
+        environment(replace(spec, noise=0.1))
+    with pytest.raises(ValueError, match="task must be one of the registered"):
+        environment(replace(spec, task="popgym-Chess"))
+
+
 def test_every_algorithm_fits_every_preset():
     algorithms = set(yaml.safe_load((ROOT / "benchmarks/hyperparams/algorithms.yml").read_text()))
     presets = [path.stem for path in (ROOT / "benchmarks/hyperparams/presets").glob("*.yml")]
@@ -230,7 +252,8 @@ def test_every_algorithm_fits_every_preset():
         for algorithm in algorithms if preset_name == "sb3" else algorithms - {"sb3-sac"}:
             algorithm_class, arguments = resolve(RunSpec(algorithm, "Ant", 0.1, 0, 1000, 4, preset_name, 500, 1))
             env = gym.make("sb3_gac/InvertedDoublePendulum-v5")
-            algorithm_class("MultiInputPolicy", env, **{**instantiate(arguments), "buffer_size": 1_000, "device": "cpu"})
+            settings = {"policy": "MultiInputPolicy", **instantiate(arguments), "buffer_size": 1_000, "device": "cpu"}
+            algorithm_class(env=env, **settings)
 
 
 def test_the_librarys_small_preset_is_the_benchmarks():

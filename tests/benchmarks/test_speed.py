@@ -1,13 +1,17 @@
 """What the speed benchmark counts and compares."""
 
+import cProfile
 import multiprocessing
+import pstats
 import time
 
 import pytest
 import torch as th
 
 from benchmarks.contenders import alternate, process_timers, timer
-from benchmarks.speed import compare_buffers, compare_steps, profile_rollout, step_flops
+from benchmarks.models import step_flops
+from benchmarks.profiles import cumulative_seconds, profile_rollout, profile_step
+from benchmarks.speed import compare_buffers, compare_steps
 
 
 def test_arithmetic_of_a_step_by_hand():
@@ -62,3 +66,37 @@ def test_shares_of_the_rollout_add_up():
     row = profile_rollout(n_envs=2, vec_steps=20)
     assert row["gradient_share"] + row["physics_share"] + row["other_share"] == pytest.approx(1, abs=0.002)
     assert 0 < row["physics_share"] < row["gradient_share"] < 1
+
+
+def test_a_steps_parts_add_up():
+    rows = profile_step("gac-compiled", (2, 3, 1), batch=8, width=8, steps=3)
+    products, *parts = rows
+    assert products["part"].startswith("matrix products")
+    assert sum(row["share"] for row in parts) == pytest.approx(1, abs=0.01)
+    assert all(row["share"] > 0 for row in rows)
+
+
+def test_time_in_a_function_by_who_called_it():
+    profiler = cProfile.Profile()
+    profiler.enable()
+    _first()
+    _second()
+    profiler.disable()
+    stats = pstats.Stats(profiler)
+    from_all = cumulative_seconds(stats, "test_speed.py", "_slow")
+    from_first = cumulative_seconds(stats, "test_speed.py", "_slow", caller=("test_speed.py", "_first"))
+    assert from_all == pytest.approx(0.03, abs=0.02)
+    assert from_first == pytest.approx(0.01, abs=0.008)
+    assert from_first < 0.6 * from_all
+
+
+def _slow(seconds):
+    time.sleep(seconds)
+
+
+def _first():
+    _slow(0.01)
+
+
+def _second():
+    _slow(0.02)

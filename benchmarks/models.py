@@ -1,0 +1,113 @@
+"""What the speed benchmark times: gradient steps of several algorithms on random data, and their arithmetic."""
+
+import importlib.util
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
+
+import sb3_gac
+from benchmarks.contenders import alternate, timer
+
+SIZES = {"HalfCheetah": (8, 17, 6), "Ant": (13, 27, 8), "Humanoid": (169, 270, 17)}
+COMPILED, MIXED = {"compile": True}, {"compile": True, "mixed_precision": True}
+CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {  # name -> class and arguments
+    "sac": (SAC, {}),
+    "gac": (sb3_gac.GAC, {}),
+    "gac-compiled": (sb3_gac.GAC, COMPILED),
+    "gac-mixed": (sb3_gac.GAC, MIXED),
+    "sac-asym": (sb3_gac.AsymmetricSAC, {}),
+    "sac-asym-compiled": (sb3_gac.AsymmetricSAC, COMPILED),
+}
+if importlib.util.find_spec("sbx"):
+    import sbx  # type: ignore[import-not-found]
+
+    CONTENDERS["sbx-sac"] = (sbx.SAC, {})
+
+
+class SpacesOnly(gym.Env):
+    """
+    An environment that is only asked for its spaces and for random observations.
+
+    :param partial: size of the partial entry
+    :param privileged: size of the privileged entry
+    :param actions: number of actions
+    """
+
+    def __init__(self, partial: int, privileged: int, actions: int):
+        self.observation_space = spaces.Dict(
+            partial=spaces.Box(-np.inf, np.inf, (partial,), np.float32),
+            privileged=spaces.Box(-np.inf, np.inf, (privileged,), np.float32),
+        )
+        self.action_space = spaces.Box(-1, 1, (actions,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """A random observation."""
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """A random observation and reward."""
+        return self.observation_space.sample(), float(self.np_random.standard_normal()), False, False, {}
+
+
+def make_model(contender: str, sizes: tuple[int, int, int], batch: int, width: int) -> Any:
+    """
+    :param contender: a key of ``CONTENDERS``
+    :param sizes: partial, privileged, actions
+    :param batch: batch size
+    :param width: of the two hidden layers
+    :return: a model with a buffer of random transitions
+    """
+    algorithm, arguments = CONTENDERS[contender]
+    settings = {"batch_size": batch, "learning_starts": 10**9, "buffer_size": 4_000, "seed": 0, "device": "cpu"} | arguments
+    if algorithm.__module__.startswith("sbx"):  # knows no dicts
+        env: gym.Env = gym.wrappers.FlattenObservation(SpacesOnly(*sizes))
+        model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [width, width]}, **settings)
+    else:
+        kwargs = {"net_arch": [width, width], "activation_fn": th.nn.SiLU}
+        model = algorithm("MultiInputPolicy", SpacesOnly(*sizes), policy_kwargs=kwargs, **settings)
+    model.set_logger(Logger(None, []))
+    return model.learn(2_000)
+
+
+def make_step(contender: str, sizes: tuple[int, int, int], batch: int, width: int) -> Callable[[], None]:
+    """
+    :return: one gradient step of :func:`make_model`'s model, as ``learn`` makes it
+    """
+    model = make_model(contender, sizes, batch, width)
+    return lambda: model.train(1, batch)
+
+
+def step_flops(sizes: tuple[int, int, int], batch: int, width: int) -> float:
+    """
+    Floating-point operations of the matrix products in one GAC step; gradients that nothing uses are not counted.
+
+    :param sizes: partial, privileged, actions
+    :param batch: B
+    :param width: H, of both hidden layers
+    """
+    partial, privileged, actions = sizes
+    full = partial + privileged
+
+    def passes(inputs: int, outputs: int, forward: int, weights: int, activations: int, input_gradients: int) -> float:
+        forward_cost = inputs * width + width * width + width * outputs
+        behind_the_first = width * width + width * outputs
+        return (forward + weights) * forward_cost + activations * behind_the_first + input_gradients * actions * width
+
+    critics = passes(full + actions, 1, forward=12, weights=4, activations=8, input_gradients=4)
+    guider = passes(full, 2 * actions, forward=2, weights=1, activations=1, input_gradients=0)
+    learner = passes(partial, 2 * actions, forward=2, weights=1, activations=1, input_gradients=0)
+    return 2.0 * batch * (critics + guider + learner)
+
+
+def matmul_rate(batch: int, width: int) -> float:
+    """Floating-point operations per second of one plain (B, H) x (H, H) product."""
+    x, weight = th.randn(batch, width), th.randn(width, width)
+    seconds = alternate({"mm": timer(lambda: th.mm(x, weight))}, repetitions=100, rounds=5)["mm"]
+    return 2.0 * batch * width * width / float(np.median(seconds))

@@ -1,0 +1,122 @@
+"""Where the time goes: of a gradient step, and of training as a whole."""
+
+import cProfile
+import pstats
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+import sb3_gac
+from benchmarks.contenders import timer
+from benchmarks.models import make_model, matmul_rate, step_flops
+
+PARTS = {  # of a compiled gradient step -> file and function
+    "compiled losses and gradients": ("compilation.py", "__call__"),
+    "optimisers": ("adam.py", "step"),
+    "dual variables": ("dual.py", "update"),
+    "targets": ("policies.py", "update_targets"),
+    "sampling": ("buffers.py", "sample"),
+}
+
+
+def profile_step(contender: str, sizes: tuple[int, int, int], batch: int, width: int, steps: int) -> list[dict[str, Any]]:
+    """
+    Where the time of a gradient step goes, on one thread.
+
+    :return: parts with their milliseconds and shares; the first, within the second, is what the matrix products would take
+        at the rate of a plain one
+    """
+    th.set_num_threads(1)
+    model = make_model(contender, sizes, batch, width)
+    model.train(steps, batch)
+    profiler = cProfile.Profile()
+    profiler.enable()
+    model.train(steps, batch)
+    profiler.disable()
+    stats = pstats.Stats(profiler)
+    total = stats.total_tt  # type: ignore[attr-defined]
+    inside = {part: cumulative_seconds(stats, *where) for part, where in PARTS.items()}
+    inside["optimisers"] -= cumulative_seconds(stats, "adam.py", "step", caller=("dual.py", "update"))
+    products = steps * step_flops(sizes, batch, width) / matmul_rate(batch, width)
+    rows = {"matrix products, at a plain one's rate": products, **inside, "all else": total - sum(inside.values())}
+    return [
+        {
+            "contender": contender,
+            "part": part,
+            "milliseconds": round(1e3 * seconds / steps, 2),
+            "share": round(seconds / total, 3),
+        }
+        for part, seconds in rows.items()
+    ]
+
+
+def cumulative_seconds(stats: pstats.Stats, file: str, function: str, caller: tuple[str, str] | None = None) -> float:
+    """
+    :param stats: of a profile
+    :param file: end of a file's name
+    :param function: in that file
+    :param caller: file and function, if only calls from there count
+    :return: in the function and all that it calls
+    """
+    total = 0.0
+    for (name, _, called), (_, _, _, cumulative, callers) in stats.stats.items():  # type: ignore[attr-defined]
+        if called == function and name.endswith(file):
+            from_there = [
+                times[3] for (at, _, by), times in callers.items() if caller and at.endswith(caller[0]) and by == caller[1]
+            ]
+            total += sum(from_there) if caller else cumulative
+    return total
+
+
+def env_step(env: gym.Env) -> Callable[[], None]:
+    """
+    :param env: to step with one action over and over, reset where an episode ends
+    """
+    action = env.action_space.sample()
+    env.reset(seed=0)
+
+    def step() -> None:
+        if any(env.step(action)[2:4]):
+            env.reset()
+
+    return step
+
+
+def profile_rollout(n_envs: int, vec_steps: int) -> dict[str, float]:
+    """
+    Where the time of ``learn`` goes on HalfCheetah, with one gradient step per environment step.
+
+    :param n_envs: environments side by side
+    :param vec_steps: steps of all of them
+    :return: environment steps per second, and the shares of gradient steps, of physics (with our wrappers, without SB3's
+        vector environment), and of all else
+    """
+    vec_env = make_vec_env("sb3_gac/HalfCheetah-v5", n_envs, seed=0, env_kwargs={"noise_std": 0.1})
+    small = {**sb3_gac.preset("small"), "learning_starts": 0, "buffer_size": 50_000, "device": "cpu"}
+    model = sb3_gac.GAC("MultiInputPolicy", vec_env, **small)
+    model.learn(4 * n_envs)
+    spent = {"gradient": 0.0}
+    train = model.train
+
+    def timed_train(*args: Any, **kwargs: Any) -> None:
+        start = time.perf_counter()
+        train(*args, **kwargs)
+        spent["gradient"] += time.perf_counter() - start
+
+    model.train = timed_train  # type: ignore[method-assign]
+    start = time.perf_counter()
+    model.learn(vec_steps * n_envs)
+    total = time.perf_counter() - start
+    physics = n_envs * vec_steps * float(np.median([timer(env_step(vec_env.envs[0]))(300) for _ in range(5)]))  # type: ignore
+    shares = {"gradient_share": spent["gradient"] / total, "physics_share": physics / total}
+    rounded = {name: round(share, 3) for name, share in shares.items()}
+    return {
+        "steps_per_second": round(vec_steps * n_envs / total, 1),
+        **rounded,
+        "other_share": round(1 - sum(shares.values()), 3),
+    }

@@ -1,0 +1,198 @@
+"""
+The fifteen POPGym tasks of the paper: games that are won by remembering, with a summary of the history as privileged entry.
+
+What is privileged says only what a player with a perfect memory knows: never a ship, a mine or a card that was not shown.
+POPGym (extra ``popgym``) is imported when a task is made.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
+from sb3_gac.envs.wrappers import FlattenMultiDiscrete, Observation, PreviousAction, reset_with
+
+LEVELS = ("Easy", "Medium", "Hard")
+
+
+def _one_hot(values: np.ndarray, n_values: int) -> np.ndarray:
+    """
+    :param values: integers below ``n_values``
+    :return: shape (number of values * n_values,)
+    """
+    return np.eye(n_values, dtype=np.float32)[np.ravel(values)].ravel()
+
+
+class Summary:
+    """
+    What a player with a perfect memory knows, as a vector in [0, 1].
+
+    :param game: of POPGym
+    """
+
+    size: int
+
+    def __init__(self, game: Any):
+        self.game = game
+
+    def of(self, observation: Any) -> np.ndarray:
+        """
+        :param observation: the game's newest
+        :return: shape (size,)
+        """
+        raise NotImplementedError  # pragma: no cover
+
+
+class CardToName(Summary):
+    """Autoencode and RepeatPrevious: the suit that is to be named now, one of four or none yet."""
+
+    size = 5
+
+    def of(self, observation: Any) -> np.ndarray:
+        """See :meth:`Summary.of`."""
+        card = self._card()
+        return _one_hot(np.array(4 if card is None else self.game.deck.suits_idx[card]), 5)
+
+    def _card(self) -> Any:
+        raise NotImplementedError  # pragma: no cover
+
+
+class LastCardLeft(CardToName):
+    """Autoencode: cards are named in reverse, once all were shown."""
+
+    def _card(self) -> Any:
+        cards = self.game.deck["system"]
+        return cards[-1] if int(self.game.mode) == 0 and cards else None
+
+
+class CardBefore(CardToName):
+    """RepeatPrevious: the card k steps ago."""
+
+    def _card(self) -> Any:
+        shown, k = self.game.deck["player"], self.game.k
+        return shown[-k] if len(shown) >= k else None
+
+
+class Guesses(Summary):
+    """Battleship: which tiles were shot at; with ``hits``, also which of them were ships."""
+
+    def __init__(self, game: Any, hits: bool = False):
+        super().__init__(game)
+        self._hits = hits
+        self.size = game.board_size**2 * (2 if hits else 1)
+
+    def of(self, observation: Any) -> np.ndarray:
+        """See :meth:`Summary.of`."""
+        planes = [self.game.guesses, self.game.guesses * self.game.board] if self._hits else [self.game.guesses]
+        return np.stack(planes).astype(np.float32).ravel()
+
+
+class SeenFaces(Summary):
+    """Concentration: the face that was last seen at each position, or that none was."""
+
+    def __init__(self, game: Any):
+        super().__init__(game)
+        self._n_faces = int(game.facedown_card) + 1
+        self.size = game.deck.num_cards * self._n_faces
+        self._seen = np.empty(0, dtype=np.int64)
+
+    def of(self, observation: Any) -> np.ndarray:
+        """See :meth:`Summary.of`."""
+        if self.game.curr_step == 0:
+            self._seen = np.full(self.game.deck.num_cards, self.game.facedown_card, dtype=np.int64)
+        self._seen = np.where(observation == self.game.facedown_card, self._seen, observation)
+        return _one_hot(self._seen, self._n_faces)
+
+
+class ViewedSquares(Summary):
+    """MineSweeper: the number of mines around each square that was viewed, or that it was not."""
+
+    VIEWED = 2
+
+    def __init__(self, game: Any):
+        super().__init__(game)
+        self._n_values = int(game.observation_space.n) + 1
+        self.size = int(np.prod(game.dims)) * self._n_values
+
+    def of(self, observation: Any) -> np.ndarray:
+        """See :meth:`Summary.of`."""
+        viewed = self.game.hidden_grid == self.VIEWED
+        return _one_hot(np.where(viewed, self.game.neighbor_grid, self._n_values - 1), self._n_values)
+
+
+SUMMARIES: dict[str, Callable[..., Summary]] = {
+    "Autoencode": LastCardLeft,
+    "Battleship": Guesses,
+    "Concentration": SeenFaces,
+    "MineSweeper": ViewedSquares,
+    "RepeatPrevious": CardBefore,
+}
+TASKS = tuple(f"{game}{level}" for game in SUMMARIES for level in LEVELS)
+
+
+class SummarisedGame(gym.Wrapper):
+    """
+    A game with its observation as a vector, ``partial``, and a summary of its history, ``privileged``.
+
+    :param game: of POPGym
+    :param summary: of that game
+    """
+
+    def __init__(self, game: gym.Env, summary: Summary):
+        super().__init__(game)
+        self._summary = summary
+        partial = spaces.Box(0.0, 1.0, (spaces.flatdim(game.observation_space),), np.float32)
+        privileged = spaces.Box(0.0, 1.0, (summary.size,), np.float32)
+        self.observation_space = spaces.Dict({PARTIAL: partial, PRIVILEGED: privileged})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """
+        :param seed: of the game
+        :param options: of the game
+        :return: observation, info
+        """
+        observation, info = reset_with(self.env, seed, options)
+        return self._views(observation), info
+
+    def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
+        """
+        :param action: of the game
+        :return: observation, reward, terminated, truncated, info
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._views(observation), float(reward), bool(terminated), bool(truncated), info
+
+    def _views(self, observation: Any) -> Observation:
+        partial = spaces.flatten(self.env.observation_space, observation)
+        return {PARTIAL: np.asarray(partial, dtype=np.float32), PRIVILEGED: self._summary.of(observation)}
+
+
+def make_popgym(task: str, previous_reward: bool = False, **summary: Any) -> gym.Env:
+    """
+    :param task: one of ``TASKS``
+    :param previous_reward: whether ``partial`` has the previous reward beside the previous action
+    :param summary: options of the game's privileged entry: ``hits=True`` for Battleship
+    :raises ValueError: if the task is unknown
+    :raises ImportError: if POPGym is not installed
+    """
+    if task not in TASKS:
+        raise ValueError(f"task must be one of {list(TASKS)}, got {task!r}.")
+    try:
+        from popgym import envs as games
+    except ImportError:
+        raise ImportError(f'sb3_gac/popgym-{task}-v0 needs POPGym: pip install "sb3_gac[popgym]".') from None
+    game = getattr(games, task)()
+    name = next(name for name in SUMMARIES if task.startswith(name))
+    env: gym.Env = SummarisedGame(game, SUMMARIES[name](game, **summary))
+    if isinstance(env.action_space, spaces.MultiDiscrete):
+        env = FlattenMultiDiscrete(env)
+    return PreviousAction(env, reward=previous_reward)
+
+
+def register_popgym() -> None:
+    """Register ``sb3_gac/popgym-<task>-v0`` for every task; the games end by themselves."""
+    for task in TASKS:
+        gym.register(f"sb3_gac/popgym-{task}-v0", entry_point="sb3_gac.envs.popgym:make_popgym", kwargs={"task": task})

@@ -1,0 +1,223 @@
+"""Policies that remember: GAC and the SAC family with GRU and LSTM, on discrete and continuous actions."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_gac import GAC, AsymmetricSAC, CompactDictReplayBuffer, GACShare, GACWithoutQ
+from tests.helpers import Recall
+
+ALGORITHMS = [GAC, AsymmetricSAC]
+POLICIES = ["MultiInputGruPolicy", "MultiInputLstmPolicy"]
+SMALL = {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8]}
+
+
+def _model(cls=GAC, policy="MultiInputGruPolicy", env=None, **arguments):
+    defaults = {"learning_starts": 40, "batch_size": 4, "buffer_size": 1000, "seed": 0, "device": "cpu"}
+    env = Recall() if env is None else env
+    return cls(policy, env, **{**defaults, "policy_kwargs": dict(SMALL), **arguments})
+
+
+def _observations(steps, batch):
+    return {"partial": th.rand(steps, batch, 4), "privileged": th.rand(steps, batch, 3)}
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_the_deployed_policy_remembers_what_it_saw(cls):
+    """The cue is gone when it is asked for: 1 for a memory, 1/3 by chance."""
+    model = _model(
+        cls,
+        learning_starts=200,
+        batch_size=32,
+        learning_rate=3e-3,
+        ent_coef=0.02,
+        tau=0.02,
+        gamma=0.9,
+        policy_kwargs={"net_arch": [16], "rnn_hidden_size": 16, "rnn_net_arch": [16]},
+    ).learn(2000)
+    returns, _ = evaluate_policy(model, Recall(), n_eval_episodes=60, warn=False)
+    assert returns > 0.9
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("continuous", [False, True])
+def test_acting_step_by_step_is_what_training_sees(cls, policy, continuous):
+    model = _model(cls, policy, Recall(continuous=continuous))
+    network = model.policy.deployed
+    sequence = _observations(5, 3)
+    with th.no_grad():
+        at_once = network(sequence)
+        state, starts = None, np.ones(3, dtype=bool)
+        for step in range(5):
+            one = {key: value[step] for key, value in sequence.items()}
+            distribution, state = network.remember(one, state, starts)
+            for part, whole in zip(distribution, at_once, strict=True):
+                th.testing.assert_close(part, whole[step])
+            starts = np.zeros(3, dtype=bool)
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_predict_carries_its_state_and_forgets_at_an_episodes_start(continuous):
+    model = _model(env=Recall(continuous=continuous))
+    obs = {"partial": np.random.default_rng(0).random((2, 4), dtype=np.float32)}
+    first, state = model.predict(obs, deterministic=True)
+    _, later_state = model.predict(obs, state, np.zeros(2, dtype=bool), deterministic=True)
+    again, state_again = model.predict(obs, later_state, np.ones(2, dtype=bool), deterministic=True)
+    assert not np.allclose(state[0], later_state[0])
+    assert np.array_equal(first, again)
+    assert np.allclose(state[0], state_again[0])
+    single, state = model.predict({"partial": obs["partial"][0]}, deterministic=True)
+    assert np.allclose(single, first[0])
+    assert state[0].shape == (1, 8)
+
+
+def test_the_guider_carries_two_states():
+    model = _model()
+    obs = {key: value[0].numpy() for key, value in _observations(1, 3).items()}
+    action, state = model.predict_guider(obs)
+    assert action.shape == (3,)
+    assert [part.shape for part in state] == [(3, 8), (3, 8)]
+    model.predict_guider(obs, state, np.zeros(3, dtype=bool))
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, GACShare, GACWithoutQ])
+@pytest.mark.parametrize("continuous", [False, True])
+def test_padding_changes_no_loss_and_no_gradient(cls, continuous):
+    """A batch of one episode alone, and with other numbers behind its end that the mask leaves out."""
+    models = [_model(cls, env=Recall(continuous=continuous), learning_starts=1000) for _ in range(2)]
+    plain, padded = (model.learn(60) for model in models)
+    np.random.seed(0)
+    batch = plain._sample_batch(6)
+    steps = len(batch.actions)
+
+    def pad(x):
+        return th.cat([x, th.rand(3, *x.shape[1:]).to(x.dtype)])
+
+    sequence = {key: pad(value) for key, value in batch.sequence.items()}
+    longer = batch._replace(
+        observations={key: value[:-1] for key, value in sequence.items()},
+        next_observations={key: value[1:] for key, value in sequence.items()},
+        sequence=sequence,
+        actions=pad(batch.actions),
+        rewards=pad(batch.rewards),
+        dones=pad(batch.dones),
+        mask=th.cat([batch.mask, th.zeros(3, 6)]),
+    )
+    noise = th.randn(4, steps + 3, 6, 1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(th, "randn", lambda shape, **kwargs: noise[: shape[0], : shape[1]])
+        for model, one in ((plain, batch), (padded, longer)):
+            metrics = model._gradient_step(one)
+            model.metrics = {name: value.item() for name, value in metrics.items()}
+    for (name, p), q in zip(plain.policy.named_parameters(), padded.policy.parameters(), strict=True):
+        th.testing.assert_close(p, q, rtol=1e-5, atol=1e-7, msg=lambda text, name=name: f"{name}: {text}")
+    unmasked = {"learner_std", "learner_mean_abs", "learner_max_prob", "actor_std", "actor_mean_abs", "actor_max_prob"}
+    for name in set(plain.metrics) - unmasked:
+        assert padded.metrics[name] == pytest.approx(plain.metrics[name], rel=1e-4, abs=1e-6), name
+
+
+def test_burn_in_brings_memories_up_and_counts_for_nothing():
+    """Steps before the mask change the loss by what is remembered of them alone, not by their rewards."""
+    model = _model(learning_starts=1000, replay_buffer_kwargs={"sequence_length": 2, "burn_in": 2}).learn(60)
+    batch = model._sample_batch(64)
+    assert (batch.mask[0] == 0).any()
+    rewards = batch.rewards + 100 * (1 - batch.mask)
+    critic = model.policy.learner_critic
+    for changed, same in ((batch._replace(rewards=rewards), True), (_with_other_start(batch), False)):
+        losses = [critic_loss_of(model, critic, one) for one in (batch, changed)]
+        assert (losses[0] == pytest.approx(losses[1], rel=1e-6)) == same
+
+
+def _with_other_start(batch):
+    sequence = {key: value.clone() for key, value in batch.sequence.items()}
+    sequence["partial"][0][batch.mask[0] == 0] += 1.0
+    return batch._replace(sequence=sequence, observations={key: value[:-1] for key, value in sequence.items()})
+
+
+def critic_loss_of(model, critic, batch):
+    return model._critic_descent("learner_critic", batch, batch.rewards).metrics["learner_critic_loss"].item()
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_the_deployed_policy_never_sees_what_is_privileged(cls):
+    model = _model(cls).learn(80)
+    sequence = {key: value.requires_grad_() for key, value in _observations(4, 2).items()}
+    output = model.policy.deployed(sequence)[0].sum()
+    gradients = th.autograd.grad(output, list(sequence.values()), allow_unused=True)
+    assert gradients[0].abs().sum() > 0
+    assert gradients[1] is None
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_saved_and_loaded_it_acts_and_goes_on_as_before(cls, policy, tmp_path):
+    model = _model(cls, policy).learn(80)
+    model.save(tmp_path / "model")
+    loaded = cls.load(tmp_path / "model", env=Recall())
+    obs = {"partial": np.random.default_rng(0).random((16, 4), dtype=np.float32)}
+    expected, state = model.predict(obs, deterministic=True)
+    actual, state_loaded = loaded.predict(obs, deterministic=True)
+    assert np.array_equal(actual, expected)
+    assert np.allclose(state[0], state_loaded[0])
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.learn(20, reset_num_timesteps=False).num_timesteps == 100
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_equal_seeds_give_equal_results_with_several_environments(cls):
+    def trained():
+        model = _model(cls, env=make_vec_env(Recall, 3, seed=1)).learn(120)
+        return th.cat([p.detach().flatten() for p in model.policy.parameters()])
+
+    assert th.equal(trained(), trained())
+
+
+def test_behind_vec_normalize():
+    env = VecNormalize(make_vec_env(Recall, 2, seed=0), norm_obs_keys=["partial"])
+    assert _model(env=env).learn(80)._n_updates > 0
+
+
+def test_while_collecting_the_memory_is_brought_up_and_forgets_with_each_episode():
+    model = _model(env=make_vec_env(Recall, 2, seed=0), learning_starts=8)
+    seen = []
+    behave = model.policy.behaviour_action
+
+    def spy(observation, state, episode_start, deterministic=False):
+        seen.append((state, np.array(episode_start)))
+        return behave(observation, state, episode_start, deterministic)
+
+    model.policy.behaviour_action = spy
+    model.learn(24)
+    assert len(seen) == 12, "in warm-up as well"
+    assert seen[0][0] is None
+    assert [starts.tolist() for _, starts in seen] == [[step % 4 == 0] * 2 for step in range(12)]
+
+
+def test_whole_episodes_can_be_the_unit_of_training():
+    model = _model(train_freq=(1, "episode"), gradient_steps=3).learn(80)
+    assert model._n_updates == 3 * (80 // 4 - 40 // 4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"compile": True}, "compile=True can't do recurrent policies"),
+        ({"n_steps": 3}, "n_steps must be 1 for a recurrent policy"),
+        ({"replay_buffer_class": DictReplayBuffer}, "A recurrent policy learns from sequences"),
+        ({"replay_buffer_class": CompactDictReplayBuffer}, "give EpisodeReplayBuffer or a subclass"),
+    ],
+)
+def test_what_recurrent_policies_cannot_have(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        _model(**arguments)
+
+
+def test_no_episode_to_learn_from():
+    with pytest.raises(ValueError, match="raise learning_starts above the length of an episode"):
+        _model(learning_starts=2).learn(10)
