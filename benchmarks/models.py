@@ -37,23 +37,30 @@ class SpacesOnly(gym.Env):
     :param partial: size of the partial entry
     :param privileged: size of the privileged entry
     :param actions: number of actions
+    :param length: steps per episode, ``None`` for one without an end
+    :param discrete: whether they are choices
     """
 
-    def __init__(self, partial: int, privileged: int, actions: int):
+    def __init__(self, partial: int, privileged: int, actions: int, length: int | None = None, discrete: bool = False):
         self.observation_space = spaces.Dict(
             partial=spaces.Box(-np.inf, np.inf, (partial,), np.float32),
             privileged=spaces.Box(-np.inf, np.inf, (privileged,), np.float32),
         )
-        self.action_space = spaces.Box(-1, 1, (actions,), np.float32)
+        self.action_space = spaces.Discrete(actions) if discrete else spaces.Box(-1, 1, (actions,), np.float32)
+        self.length = length
+        self.steps = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """A random observation."""
         super().reset(seed=seed)
+        self.steps = 0
         return self.observation_space.sample(), {}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """A random observation and reward."""
-        return self.observation_space.sample(), float(self.np_random.standard_normal()), False, False, {}
+        self.steps += 1
+        ends = self.steps == self.length
+        return self.observation_space.sample(), float(self.np_random.standard_normal()), ends, False, {}
 
 
 def make_model(contender: str, sizes: tuple[int, int, int], batch: int, width: int) -> Any:
@@ -111,3 +118,63 @@ def matmul_rate(batch: int, width: int) -> float:
     x, weight = th.randn(batch, width), th.randn(width, width)
     seconds = alternate({"mm": timer(lambda: th.mm(x, weight))}, repetitions=100, rounds=5)["mm"]
     return 2.0 * batch * width * width / float(np.median(seconds))
+
+
+class LoopedGRU(th.nn.GRU):
+    """A GRU as it is without a fused pass over time: one call for each step."""
+
+    def forward(self, x: th.Tensor, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:  # type: ignore[override]
+        """
+        :param x: shape (T, B, F)
+        :param state: shape (1, B, H)
+        :return: shapes (T, B, H) and (1, B, H)
+        """
+        outputs = []
+        for step in x.split(1):
+            output, state = super().forward(step, state)
+            outputs.append(output)
+        return th.cat(outputs), state
+
+
+def make_recurrent_step(looped: bool, sizes: tuple[int, int, int], length: int, batch: int, width: int) -> Callable[[], None]:
+    """
+    :param looped: whether a Python loop goes over time
+    :param sizes: partial, privileged, number of actions
+    :param length: of the episodes, T
+    :param batch: episodes, B
+    :param width: of all layers
+    :return: one gradient step of GAC with GRUs
+    """
+    model = sb3_gac.GAC(
+        "MultiInputGruPolicy",
+        SpacesOnly(*sizes, length=length, discrete=True),
+        policy_kwargs={"net_arch": [width], "rnn_hidden_size": width, "rnn_net_arch": [width]},
+        batch_size=batch,
+        learning_starts=10**9,
+        buffer_size=10_000,
+        seed=0,
+        device="cpu",
+    )
+    model.set_logger(Logger(None, []))
+    model.learn(40 * length)
+    if looped:
+        for module in model.policy.modules():
+            if isinstance(module, th.nn.GRU):
+                module.__class__ = LoopedGRU
+    return lambda: model.train(1, batch)
+
+
+def recurrent_step_flops(sizes: tuple[int, int, int], length: int, batch: int, width: int) -> float:
+    """
+    Floating-point operations of the matrix products in one step of :func:`make_recurrent_step`'s model.
+
+    Policies: forward over T + 1 steps, and twice that backward. Critics: the same for their own loss; once more, frozen, for
+    a policy's; their targets once.
+    """
+    partial, privileged, actions = sizes
+
+    def forward(inputs: int) -> float:
+        return inputs * width + 6 * width * width + width * width + width * actions
+
+    guider, learner, critic = forward(partial + privileged), forward(partial), forward(partial + privileged)
+    return 2.0 * batch * (length + 1) * (3 * guider + 3 * learner + 4 * (3 + 1 + 1) * critic)

@@ -22,7 +22,16 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 
 import sb3_gac
 from benchmarks.contenders import alternate, process_timers, timer
-from benchmarks.models import CONTENDERS, SIZES, SpacesOnly, make_step, matmul_rate, step_flops
+from benchmarks.models import (
+    CONTENDERS,
+    SIZES,
+    SpacesOnly,
+    make_recurrent_step,
+    make_step,
+    matmul_rate,
+    recurrent_step_flops,
+    step_flops,
+)
 from benchmarks.profiles import env_step, profile_rollout, profile_step
 from benchmarks.run import provenance
 
@@ -59,6 +68,23 @@ def compare_steps(
 def median_ratio(numerators: list[float], denominators: list[float]) -> float:
     """Of two contenders' blocks, taken side by side."""
     return float(np.median(np.array(numerators) / np.array(denominators)))
+
+
+def compare_recurrent(batch: int, width: int, threads: int, rounds: int) -> dict[str, float]:
+    """
+    :return: gradient steps per second of GAC with GRUs on RepeatPreviousEasy's sizes, as a multiple of a Python loop over
+        time, and their share of the limit
+    """
+    arguments = {name: (name == "looped", (8, 5, 4), 51, batch, width) for name in ("ours", "looped")}
+    with process_timers(make_recurrent_step, arguments, threads) as timers:
+        seconds = alternate(timers, repetitions=2, rounds=rounds)
+    th.set_num_threads(threads)
+    limit = matmul_rate(batch * 52, width) / recurrent_step_flops((8, 5, 4), 51, batch, width)
+    return {
+        "ours_per_second": round(1 / float(np.median(seconds["ours"])), 2),
+        "ours_over_looped": round(median_ratio(seconds["looped"], seconds["ours"]), 2),
+        "share_of_limit": round(1 / float(np.median(seconds["ours"])) / limit, 3),
+    }
 
 
 def compare_buffers(sizes: tuple[int, int, int], batch: int = 256, capacity: int = 20_000) -> dict[str, float]:
@@ -130,11 +156,22 @@ def tabulate_rollout(threads: list[int], quick: bool) -> list[dict[str, Any]]:
     return rows
 
 
+def tabulate_recurrent(threads: list[int], quick: bool) -> list[dict[str, Any]]:
+    """Gradient steps of GAC with GRUs on whole episodes."""
+    widths = (16,) if quick else (64, 256)
+    rows = [(count, width) for count in threads for width in widths]
+    return [
+        {"threads": count, "episodes": 16, "width": width} | compare_recurrent(16, width, count, 2 if quick else 5)
+        for count, width in rows
+    ]
+
+
 TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name -> threads, whether to be quick -> rows
     "wrappers": lambda threads, quick: [compare_wrappers(3 if quick else 10 * ROUNDS)],
     "steps": tabulate_steps,
     "profile": lambda threads, quick: profile_step("gac-compiled", SIZES["HalfCheetah"], 256, 256, 20 if quick else 200),
     "growth": tabulate_growth,
+    "recurrent": tabulate_recurrent,
     "rollout": tabulate_rollout,
     "buffers": lambda threads, quick: [{"task": task} | compare_buffers(sizes) for task, sizes in SIZES.items()],
 }

@@ -9,9 +9,9 @@ import pytest
 import torch as th
 
 from benchmarks.contenders import alternate, process_timers, timer
-from benchmarks.models import step_flops
+from benchmarks.models import LoopedGRU, recurrent_step_flops, step_flops
 from benchmarks.profiles import cumulative_seconds, profile_rollout, profile_step
-from benchmarks.speed import compare_buffers, compare_steps
+from benchmarks.speed import compare_buffers, compare_recurrent, compare_steps
 
 
 def test_arithmetic_of_a_step_by_hand():
@@ -60,6 +60,24 @@ def test_comparisons_give_finite_figures():
     assert "sac-asym_share_of_limit" not in row, "its limit is another"
     assert 0 < row["gac_share_of_limit"] < 1
     assert compare_buffers((169, 270, 17), capacity=6_000)["bytes_over_sb3"] <= 0.52
+
+
+def test_a_looped_gru_is_a_gru():
+    plain = th.nn.GRU(3, 4)
+    x, state = th.randn(5, 2, 3), th.randn(1, 2, 4)
+    looped = LoopedGRU(3, 4)
+    looped.load_state_dict(plain.state_dict())
+    for ours, theirs in zip(looped(x, state), plain(x, state), strict=True):
+        th.testing.assert_close(ours, theirs)
+
+
+def test_recurrent_arithmetic_by_hand_and_figures():
+    """One number partial, one privileged, two actions, width 2, episodes of one step: products counted one by one."""
+    learner, full = 1 * 2 + 3 * (2 * 2 + 2 * 2) + 2 * 2 + 2 * 2, 2 * 2 + 3 * (2 * 2 + 2 * 2) + 2 * 2 + 2 * 2
+    assert recurrent_step_flops((1, 1, 2), 1, batch=3, width=2) == 2 * 3 * 2 * (3 * learner + 3 * full + 4 * 5 * full)
+    row = compare_recurrent(batch=2, width=8, threads=1, rounds=1)
+    assert row["ours_per_second"] > 0 < row["ours_over_looped"]
+    assert 0 < row["share_of_limit"] < 1
 
 
 def test_shares_of_the_rollout_add_up():

@@ -39,7 +39,7 @@ def test_the_deployed_policy_remembers_what_it_saw(cls):
         gamma=0.9,
         policy_kwargs={"net_arch": [16], "rnn_hidden_size": 16, "rnn_net_arch": [16]},
     ).learn(2000)
-    returns, _ = evaluate_policy(model, Recall(), n_eval_episodes=60, warn=False)
+    returns, _ = evaluate_policy(model, make_vec_env(Recall, 1, seed=1), n_eval_episodes=60, warn=False)
     assert returns > 0.9
 
 
