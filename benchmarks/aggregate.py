@@ -118,14 +118,15 @@ def steps_to(group: pd.DataFrame, threshold: float) -> int | None:
 def guidance(group: pd.DataFrame) -> dict[str, float]:
     """
     :param group: one algorithm in one cell
-    :return: the guider's final return, and KL over its target from ``STEADY_FROM`` steps on; nothing without a guider
+    :return: the guider's final return, and KL over its target from ``STEADY_FROM`` steps on, if there are; nothing without
+        a guider
     """
     if "guider" not in group or group.guider.isna().all():
         return {}
     final = group[group.timesteps == group.timesteps.max()]
     steady = group[group.timesteps >= STEADY_FROM]
-    ratio = steady.kl / steady.target_kl
-    kl = {f"kl_over_target_{name}": round(float(getattr(ratio, name)()), 3) for name in ("min", "mean", "max")}
+    ratio = (steady.kl / steady.target_kl).dropna()
+    kl = {f"kl_over_target_{name}": round(float(getattr(ratio, name)()), 3) for name in ("min", "mean", "max") if len(ratio)}
     return {"guider_mean": round(float(final.guider.mean()), 1), **kl}
 
 
@@ -211,7 +212,7 @@ def main() -> None:
     }
     options.out.parent.mkdir(parents=True, exist_ok=True)
     tidy.round(5).to_csv(options.out.with_suffix(".csv"), index=False)
-    options.out.with_suffix(".json").write_text(json.dumps(results, indent=1))
+    options.out.with_suffix(".json").write_text(json.dumps(results, indent=1, allow_nan=False))
 
 
 if __name__ == "__main__":

@@ -129,7 +129,7 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
         iqm, low, high = cell["final_iqm"]
         kl = (
             ", ".join(f"{cell[f'kl_over_target_{name}']:.2f}" for name in ("min", "mean", "max"))
-            if "guider_mean" in cell
+            if "kl_over_target_min" in cell
             else ""
         )
         guider = f"{cell['guider_mean']:.0f}" if "guider_mean" in cell else ""
