@@ -291,3 +291,13 @@ def test_an_outside_reset_keeps_the_last_transition_whole():
 def test_bad_n_steps(n_steps):
     with pytest.raises(ValueError, match="n_steps must be at least 1"):
         small_model(n_steps=n_steps)
+
+
+def test_memory_is_exactly_linear_in_the_capacity():
+    space = spaces.Dict(partial=spaces.Box(-1, 1, (3,), np.float32), privileged=spaces.Box(-1, 1, (5,), np.float32))
+    one, two, four = (
+        CompactDictReplayBuffer(rows, space, spaces.Box(-1, 1, (2,)), device="cpu").nbytes() for rows in (1_000, 2_000, 4_000)
+    )
+    per_transition = 4 * (3 + 5 + 2 + 1) + 1
+    assert two - one == 1_000 * per_transition
+    assert four - two == 2_000 * per_transition
