@@ -16,7 +16,7 @@ from stable_baselines3 import SAC
 import sb3_gac
 from benchmarks.suite import HYPERPARAMS, RunSpec, check_keys, read_preset
 
-_CLASSES = {**{name: getattr(sb3_gac, name) for name in sb3_gac.__all__}, "stable_baselines3.SAC": SAC}
+_OTHERS_CLASSES = {"stable_baselines3.SAC": SAC}
 _LIBRARIES = {"activation_fn": th.nn, "optimizer_class": th.optim}
 
 
@@ -31,9 +31,11 @@ def read_algorithm(name: str) -> tuple[type, dict[str, Any]]:
         raise ValueError(f"algorithm must be one of {sorted(algorithms)}, got {name!r}.")
     arguments = dict(algorithms[name])
     class_name = arguments.pop("class")
-    if class_name not in _CLASSES:
-        raise ValueError(f"Algorithm {name} names the class {class_name!r}; the classes are {sorted(_CLASSES)}.")
-    return _CLASSES[class_name], arguments
+    if class_name in _OTHERS_CLASSES:
+        return _OTHERS_CLASSES[class_name], arguments
+    if class_name not in sb3_gac.__all__:
+        raise ValueError(f"Algorithm {name} names the class {class_name!r}, which neither sb3_gac nor {_OTHERS_CLASSES} has.")
+    return getattr(sb3_gac, class_name), arguments
 
 
 def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:

@@ -1,16 +1,58 @@
-"""Guided Actor-Critic for Stable-Baselines3. Importing it registers the ``sb3_gac/*`` environments with gymnasium."""
+"""
+Guided Actor-Critic for Stable-Baselines3. Importing it registers the ``sb3_gac/*`` environments with gymnasium.
 
-from sb3_gac import envs
-from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
-from sb3_gac.common.buffers import CompactDictReplayBuffer
-from sb3_gac.common.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
-from sb3_gac.common.episodes import EpisodeReplayBuffer
-from sb3_gac.common.normalization import DeploymentNormalizer
-from sb3_gac.gac.ablations import GACShare, GACWithoutQ
-from sb3_gac.gac.gac import GAC
-from sb3_gac.gac.policies import GACPolicy
-from sb3_gac.gac.presets import PRESETS, preset
+All else is imported when it is first used: :mod:`sb3_gac.learner` runs on machines that have neither torch nor gymnasium.
+"""
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
 from sb3_gac.version import __version__
+
+if find_spec("gymnasium") is not None:
+    from sb3_gac import envs
+
+if TYPE_CHECKING:
+    from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
+    from sb3_gac.common.buffers import CompactDictReplayBuffer
+    from sb3_gac.common.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
+    from sb3_gac.common.episodes import EpisodeReplayBuffer
+    from sb3_gac.common.normalization import DeploymentNormalizer
+    from sb3_gac.export import export_learner
+    from sb3_gac.gac.ablations import GACShare, GACWithoutQ
+    from sb3_gac.gac.gac import GAC
+    from sb3_gac.gac.policies import GACPolicy
+    from sb3_gac.gac.presets import PRESETS, preset
+    from sb3_gac.learner import Learner
+
+_WHERE = {
+    "GAC": "gac.gac",
+    "PRESETS": "gac.presets",
+    "AsymmetricSAC": "baselines.asymmetric_sac",
+    "CompactDictReplayBuffer": "common.buffers",
+    "DeploymentNormalizer": "common.normalization",
+    "EpisodeReplayBuffer": "common.episodes",
+    "GACPolicy": "gac.policies",
+    "GACShare": "gac.ablations",
+    "GACWithoutQ": "gac.ablations",
+    "GuiderLearnerEvalCallback": "common.callbacks",
+    "Learner": "learner",
+    "SeededEvalCallback": "common.callbacks",
+    "export_learner": "export",
+    "preset": "gac.presets",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_WHERE})
+
 
 __all__ = [
     "GAC",
@@ -23,8 +65,10 @@ __all__ = [
     "GACShare",
     "GACWithoutQ",
     "GuiderLearnerEvalCallback",
+    "Learner",
     "SeededEvalCallback",
     "__version__",
     "envs",
+    "export_learner",
     "preset",
 ]

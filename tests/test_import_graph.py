@@ -21,6 +21,7 @@ FORBIDDEN = {
         for name in BASELINES
         for pattern in ("{}.py", "{}/**/*.py")
     },
+    "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
     "benchmarks/report.py": r"torch\b|sb3_gac\b|benchmarks\b",
     "benchmarks/**/*.py": r"sb3_gac\.(.*\.)?_(?!_)",
