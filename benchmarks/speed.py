@@ -10,6 +10,7 @@ only spaces and sizes of the tasks, with random data; the rollout is that of Hal
 
 import argparse
 import json
+import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from benchmarks.models import (
     CONTENDERS,
     SIZES,
     SpacesOnly,
+    make_model,
     make_recurrent_step,
     make_step,
     matmul_rate,
@@ -125,6 +127,28 @@ def compare_wrappers(rounds: int = ROUNDS) -> dict[str, float]:
     }
 
 
+def compare_deployment(sizes: tuple[int, int, int], width: int, rounds: int) -> dict[str, float]:
+    """
+    :return: microseconds of one action from one observation: SB3 SAC's ``predict``, GAC's, and the exported learner's
+    """
+    th.set_num_threads(1)
+    gac, sac = (make_model(name, sizes, 256, width) for name in ("gac", "sac"))
+    observation = {key: box.sample() for key, box in SpacesOnly(*sizes).observation_space.items()}  # type: ignore[attr-defined]
+    with tempfile.TemporaryDirectory() as directory:
+        learner = sb3_gac.Learner.load(sb3_gac.export_learner(gac, Path(directory) / "learner.onnx"))
+    partial = observation["partial"]
+    timers = {
+        "sac_predict": timer(lambda: sac.predict(observation, deterministic=True)),
+        "gac_predict": timer(lambda: gac.predict({"partial": partial}, deterministic=True)),
+        "exported": timer(lambda: learner.act(partial)),
+    }
+    seconds = alternate(timers, repetitions=200, rounds=rounds)
+    return {
+        **{f"{name}_microseconds": round(1e6 * float(np.median(values)), 1) for name, values in seconds.items()},
+        "exported_times_faster_than_sac": round(median_ratio(seconds["sac_predict"], seconds["exported"]), 1),
+    }
+
+
 def tabulate_steps(threads: list[int], quick: bool) -> list[dict[str, Any]]:
     """Gradient steps: HalfCheetah with one thread, all sizes with more."""
     rows = []
@@ -173,6 +197,9 @@ TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name
     "growth": tabulate_growth,
     "recurrent": tabulate_recurrent,
     "rollout": tabulate_rollout,
+    "deployment": lambda threads, quick: [
+        {"width": width} | compare_deployment(SIZES["HalfCheetah"], width, 3 if quick else ROUNDS) for width in (128, 256)
+    ],
     "buffers": lambda threads, quick: [{"task": task} | compare_buffers(sizes) for task, sizes in SIZES.items()],
 }
 

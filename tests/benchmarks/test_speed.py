@@ -11,7 +11,7 @@ import torch as th
 from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.models import LoopedGRU, recurrent_step_flops, step_flops
 from benchmarks.profiles import cumulative_seconds, profile_rollout, profile_step
-from benchmarks.speed import compare_buffers, compare_recurrent, compare_steps
+from benchmarks.speed import compare_buffers, compare_deployment, compare_recurrent, compare_steps
 
 
 def test_arithmetic_of_a_step_by_hand():
@@ -84,6 +84,12 @@ def test_shares_of_the_rollout_add_up():
     row = profile_rollout(n_envs=2, vec_steps=20)
     assert row["gradient_share"] + row["physics_share"] + row["other_share"] == pytest.approx(1, abs=0.002)
     assert 0 < row["physics_share"] < row["gradient_share"] < 1
+
+
+def test_an_exported_learner_beside_predict():
+    row = compare_deployment((2, 3, 1), width=8, rounds=2)
+    assert 0 < row["exported_microseconds"] < row["gac_predict_microseconds"]
+    assert row["exported_times_faster_than_sac"] > 1
 
 
 def test_a_steps_parts_add_up():
