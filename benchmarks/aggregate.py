@@ -119,12 +119,12 @@ def guidance(group: pd.DataFrame) -> dict[str, float]:
     """
     :param group: one algorithm in one cell
     :return: the guider's final return, and KL over its target from ``STEADY_FROM`` steps on, if there are; nothing without
-        a guider
+        a guider. A row's KL is the mean since the evaluation before
     """
     if "guider" not in group or group.guider.isna().all():
         return {}
     final = group[group.timesteps == group.timesteps.max()]
-    steady = group[group.timesteps >= STEADY_FROM]
+    steady = group[group.timesteps > STEADY_FROM]
     ratio = (steady.kl / steady.target_kl).dropna()
     kl = {f"kl_over_target_{name}": round(float(getattr(ratio, name)()), 3) for name in ("min", "mean", "max") if len(ratio)}
     return {"guider_mean": round(float(final.guider.mean()), 1), **kl}

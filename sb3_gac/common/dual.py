@@ -5,6 +5,7 @@ from typing import Any
 
 import torch as th
 
+from sb3_gac.common.flat import FlatAdam
 from sb3_gac.common.losses import dual_loss
 
 
@@ -46,7 +47,7 @@ class DualVariable:
         self.bounds = bounds
         self._log_bounds = (math.log(bounds[0]), math.log(bounds[1]))
         self.log_value = th.full((1,), math.log(initial), device=device, requires_grad=True)
-        self.optimizer: th.optim.Optimizer | None = th.optim.Adam([self.log_value], lr=learning_rate, fused=True)
+        self.optimizer: th.optim.Optimizer | None = FlatAdam([self.log_value], lr=learning_rate)
         self.state_names: tuple[list[str], list[str]] = (["optimizer"], ["log_value"])
 
     @property

@@ -7,6 +7,7 @@ network, which at 256 units and less take as long as their arithmetic.  On one f
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import torch as th
 from torch import nn
@@ -28,7 +29,7 @@ class FlatParameters:
         self.parameters = list(parameters)
         ends = list(itertools.accumulate(parameter.numel() for parameter in parameters))
         self._bounds = list(itertools.pairwise([0, *ends]))
-        self._clipped_end = ends[len(parameters) - unclipped - 1]
+        self._n_clipped = len(self.parameters) - unclipped
         self.flat = nn.Parameter(self._joined(self.parameters))
         self._point_parameters_here()
 
@@ -51,13 +52,14 @@ class FlatParameters:
         :param max_norm: scale the gradient to a norm of at most this; ``None`` leaves it as it is
         :return: gradient in the order of ``flat``, zero where there is none; its norm before, scalar
         """
-        gradients = th.autograd.grad(loss, self.parameters, allow_unused=True)
-        pairs = zip(gradients, self.parameters, strict=True)
-        joined = self._joined([th.zeros_like(parameter) if gradient is None else gradient for gradient, parameter in pairs])
-        norm = th.linalg.vector_norm(joined[: self._clipped_end])
+        found = th.autograd.grad(loss, self.parameters, allow_unused=True)
+        gradients = [th.zeros_like(p) if gradient is None else gradient for gradient, p in zip(found, self.parameters, strict=True)]
+        clipped, unclipped = gradients[: self._n_clipped], gradients[self._n_clipped :]
+        norm = th.linalg.vector_norm(th.stack([th.linalg.vector_norm(gradient) for gradient in clipped]))
         if max_norm is not None:
-            joined[: self._clipped_end] *= (max_norm / (norm + 1e-6)).clamp(max=1.0)
-        return joined, norm
+            scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
+            clipped = [gradient * scale for gradient in clipped]
+        return self._joined([*clipped, *unclipped]), norm
 
     @staticmethod
     @th.no_grad()
@@ -67,3 +69,48 @@ class FlatParameters:
     def _point_parameters_here(self) -> None:
         for parameter, (low, high) in zip(self.parameters, self._bounds, strict=True):
             parameter.data = self.flat.data[low:high].view(parameter.shape)
+
+
+class FlatAdam(th.optim.Adam):
+    """
+    Adam on one flat parameter a group: the same arithmetic and state as ``torch.optim.Adam``'s, whose bookkeeping for any
+    number of tensors takes longer than the arithmetic at 256 units and less.
+
+    :param args: of ``torch.optim.Adam``
+    :param kwargs: of ``torch.optim.Adam``; ``fused`` is always true
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{**kwargs, "fused": True})
+
+    @th.no_grad()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """
+        One step down each flat parameter's gradient.
+
+        :param closure: not supported
+        """
+        for group in self.param_groups:
+            (flat,) = group["params"]
+            state = self.state[flat]
+            if not state or group["amsgrad"]:
+                super().step()
+                return
+            state["step"] += 1
+            th._fused_adam_(
+                [flat],
+                [flat.grad],
+                [state["exp_avg"]],
+                [state["exp_avg_sq"]],
+                [],
+                [state["step"]],
+                lr=group["lr"],
+                beta1=group["betas"][0],
+                beta2=group["betas"][1],
+                weight_decay=group["weight_decay"],
+                eps=group["eps"],
+                amsgrad=False,
+                maximize=group["maximize"],
+            )
+
+    step.hooked = True  # type: ignore[attr-defined]  # no profiler range around each step

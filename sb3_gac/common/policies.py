@@ -16,7 +16,7 @@ from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy
 from sb3_gac.common.distributions import Distribution
-from sb3_gac.common.flat import FlatParameters
+from sb3_gac.common.flat import FlatAdam, FlatParameters
 from sb3_gac.common.memory import Memory
 from sb3_gac.common.networks import CriticEnsemble, DiscreteCriticEnsemble, VectorExtractor, polyak_average, trainable
 from sb3_gac.common.roles import RoleKeys, Roles, resolve_lr_scales, resolve_net_arch, resolve_role_keys, role_space
@@ -173,13 +173,14 @@ class AsymmetricPolicy(BasePolicy):
         for role in self.roles.others:
             if getattr(self, role) is not None:
                 self.flat_parameters[role] = FlatParameters(trainable(getattr(self, role).parameters(), but=deployed))
-        kwargs = dict(self.optimizer_kwargs)
-        if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
-            kwargs.setdefault("fused", True)
+        optimizer_class, kwargs = self.optimizer_class, dict(self.optimizer_kwargs)
+        if "foreach" not in kwargs and kwargs.get("fused", True):
+            optimizer_class = FlatAdam if optimizer_class is th.optim.Adam else optimizer_class
+            kwargs |= {"fused": True} if issubclass(optimizer_class, (th.optim.Adam, th.optim.AdamW)) else {}
         lr_scales = resolve_lr_scales(self.roles, self.constructor_options["lr_scales"])
         for role, parameters in self.flat_parameters.items():
             group = {"params": [parameters.flat], "lr_scale": lr_scales[role]}
-            getattr(self, role).optimizer = self.optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore
+            getattr(self, role).optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore
         self._collect_targets()
 
     def _collect_targets(self) -> None:

@@ -108,7 +108,7 @@ def test_a_missing_run_is_an_error_or_leaves_its_whole_cell_out(runs, tmp_path):
 
 
 def _evaluations(algorithm, seed, learner, task="T", guider=None):
-    rows = pd.DataFrame({"timesteps": [4_000, 8_000], "learner": learner, "task": task, "noise": 0.1, "algorithm": algorithm})
+    rows = pd.DataFrame({"timesteps": [5_000, 10_000], "learner": learner, "task": task, "noise": 0.1, "algorithm": algorithm})
     if guider is not None:
         rows = rows.assign(guider=guider, kl=[0.5, 0.008 + 0.003 * seed], target_kl=0.01)
     return rows.assign(seed=seed)
@@ -127,7 +127,7 @@ def test_summary_by_hand():
     assert (ours["seeds"], ours["final"], ours["final_mean"]) == ([0, 1], [10, 30], 20)
     assert ours["final_iqm"] == [20, 10, 30]
     assert ours["area_iqm"][0] == 11
-    assert (ours["steps_to_reference"], theirs["steps_to_reference"]) == (4_000, 8_000)
+    assert (ours["steps_to_reference"], theirs["steps_to_reference"]) == (5_000, 10_000)
     assert ours["guider_mean"] == 21
     assert (ours["kl_over_target_min"], ours["kl_over_target_max"]) == (0.8, 1.1)
     assert theirs["final_iqm"] == [2, 2, 2]

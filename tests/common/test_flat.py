@@ -6,7 +6,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_gac.common.flat import FlatParameters
+from sb3_gac.common.flat import FlatAdam, FlatParameters
 from tests.helpers import small_model
 
 
@@ -20,10 +20,11 @@ def _joined(tensors):
     return th.cat([tensor.detach().flatten() for tensor in tensors])
 
 
-def test_an_optimiser_of_the_flat_parameter_does_what_one_of_all_parameters_does(network):
+@pytest.mark.parametrize("optimizer_class", [th.optim.Adam, FlatAdam])
+def test_an_optimiser_of_the_flat_parameter_does_what_one_of_all_parameters_does(network, optimizer_class):
     twin = deepcopy(network)
     flat = FlatParameters(list(network.parameters()))
-    ours = th.optim.Adam([flat.flat], lr=0.01, weight_decay=0.1)
+    ours = optimizer_class([flat.flat], lr=0.01, weight_decay=0.1)
     theirs = th.optim.Adam(twin.parameters(), lr=0.01, weight_decay=0.1)
     for _ in range(5):
         x = th.randn(8, 3)
@@ -102,3 +103,24 @@ def test_a_copied_policy_trains_on(network):
         "guider_critic_target.output.bias",
     ):
         assert not th.equal(before[name], model.policy.get_parameter(name)), name
+
+
+def _after_steps(optimizer, parameter, gradients):
+    for gradient in gradients:
+        parameter.grad = gradient.clone()
+        optimizer.step()
+    return parameter.detach()
+
+
+@pytest.mark.parametrize("options", [{}, {"betas": (0.5, 0.9), "eps": 0.1}, {"amsgrad": True}, {"maximize": True}])
+def test_flat_adam_is_adam_to_the_bit_and_goes_on_from_its_state(options):
+    gradients = th.randn(6, 5, generator=th.Generator().manual_seed(0))
+    ours, theirs = (nn.Parameter(th.ones(5)) for _ in range(2))
+    flat = FlatAdam([ours], lr=0.1, **options)
+    adam = th.optim.Adam([theirs], lr=0.1, fused=True, **options)
+    assert th.equal(_after_steps(flat, ours, gradients[:3]), _after_steps(adam, theirs, gradients[:3]))
+    again = FlatAdam([ours], lr=0.1, **options)
+    again.load_state_dict(deepcopy(adam.state_dict()))
+    for optimizer in (again, adam):  # as a schedule does
+        optimizer.param_groups[0]["lr"] = 0.01
+    assert th.equal(_after_steps(again, ours, gradients[3:]), _after_steps(adam, theirs, gradients[3:]))
