@@ -53,7 +53,9 @@ class FlatParameters:
         :return: gradient in the order of ``flat``, zero where there is none; its norm before, scalar
         """
         found = th.autograd.grad(loss, self.parameters, allow_unused=True)
-        gradients = [th.zeros_like(p) if gradient is None else gradient for gradient, p in zip(found, self.parameters, strict=True)]
+        gradients = [
+            th.zeros_like(p) if gradient is None else gradient for gradient, p in zip(found, self.parameters, strict=True)
+        ]
         clipped, unclipped = gradients[: self._n_clipped], gradients[self._n_clipped :]
         norm = th.linalg.vector_norm(th.stack([th.linalg.vector_norm(gradient) for gradient in clipped]))
         if max_norm is not None:
