@@ -149,9 +149,8 @@ class GAC(GuidedUpdate):
             check_positive("max_kl", self.max_kl, remedy="or None for no hard bound")
             if not isinstance(self.action_space, spaces.Box):
                 raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
-        if self.learner_kl_scale == "auto":
-            self.learner_kl_scale = 0.0 if self.guider == "residual" else 1.0
-        check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
+        if self.learner_kl_scale != "auto":
+            check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
 
     def _policy_options(self) -> dict[str, Any]:
         return super()._policy_options() | {
