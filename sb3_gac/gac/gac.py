@@ -40,8 +40,8 @@ class GAC(GuidedUpdate):
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
         is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
         learner: a pull towards it closes no gap, and the learner chases what moves along with it
-    :param learner_entropy: SAC's entropy term in the learner's objective and critics, without which its mean drifts
-        into saturation; False for eqs. 15 and 16 as printed
+    :param learner_entropy: SAC's entropy term in the learner's objective and critics; False for eqs. 15 and 16 as printed,
+        where nothing but the KL keeps the learner's mean from growing
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
