@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
     from sb3_gac.common.buffers import CompactDictReplayBuffer
     from sb3_gac.common.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
+    from sb3_gac.common.checkpoint_callback import ExactCheckpointCallback
+    from sb3_gac.common.checkpoint_files import CheckpointError
     from sb3_gac.common.episodes import EpisodeReplayBuffer
     from sb3_gac.common.normalization import DeploymentNormalizer
     from sb3_gac.export import export_learner
@@ -30,9 +32,11 @@ _WHERE = {
     "GAC": "gac.gac",
     "PRESETS": "gac.presets",
     "AsymmetricSAC": "baselines.asymmetric_sac",
+    "CheckpointError": "common.checkpoint_files",
     "CompactDictReplayBuffer": "common.buffers",
     "DeploymentNormalizer": "common.normalization",
     "EpisodeReplayBuffer": "common.episodes",
+    "ExactCheckpointCallback": "common.checkpoint_callback",
     "GACPolicy": "gac.policies",
     "GACShare": "gac.ablations",
     "GACWithoutQ": "gac.ablations",
@@ -58,9 +62,11 @@ __all__ = [
     "GAC",
     "PRESETS",
     "AsymmetricSAC",
+    "CheckpointError",
     "CompactDictReplayBuffer",
     "DeploymentNormalizer",
     "EpisodeReplayBuffer",
+    "ExactCheckpointCallback",
     "GACPolicy",
     "GACShare",
     "GACWithoutQ",

@@ -37,6 +37,12 @@ class TwoViewBandit(gym.Env):
         self._step += 1
         return self._draw(), reward, self._step >= self.length, False, {}
 
+    def checkpoint_state(self) -> dict[str, Any]:
+        return {"target": self._target, "step": self._step}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        self._target, self._step = state["target"], state["step"]
+
     def _draw(self) -> dict[str, np.ndarray]:
         self._target = self.np_random.uniform(-0.8, 0.8)
         seen = self._target + self.noise_std * self.np_random.standard_normal()
@@ -90,6 +96,12 @@ class Recall(gym.Env):
         last = self._step == self.length
         return self._views(), float(last and action == self._cue), last, False, {}
 
+    def checkpoint_state(self) -> dict[str, Any]:
+        return {"cue": self._cue, "step": self._step}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        self._cue, self._step = state["cue"], state["step"]
+
     def _views(self) -> dict[str, np.ndarray]:
         partial = np.zeros(4, dtype=np.float32)
         if self._step == 0:
@@ -108,7 +120,7 @@ def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
         "device": "cpu",
         "policy_kwargs": {"net_arch": [16]},
     }
-    return cls("MultiInputPolicy", TwoViewBandit() if env is None else env, **{**defaults, **arguments})
+    return cls(**{"policy": "MultiInputPolicy", "env": TwoViewBandit() if env is None else env, **defaults, **arguments})
 
 
 def optimizers_of(policy: Any) -> list[Any]:

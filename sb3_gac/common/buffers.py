@@ -110,6 +110,33 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         self._finals = FinalObservations(self.layout)
         self.endings[:] = 0
 
+    # --- checkpoints -------------------------------------------------------------------------------------------------
+
+    @property
+    def n_added(self) -> int:
+        """Transitions ever added, per environment."""
+        return self._n_added
+
+    def rows_by_name(self) -> dict[str, np.ndarray]:
+        """What the ring holds, by row: arrays of shape (rows, n_envs, \\*), not copied; a step writes its row and the next."""
+        return {**self._rows, "actions": self.actions, "rewards": self.rewards, "endings": self.endings}
+
+    def bookkeeping(self) -> dict[str, Any]:
+        """All else that there is, for :meth:`restore_bookkeeping`."""
+        return {"n_added": self._n_added, "shape": list(self.rewards.shape), "finals": self._finals.state()}
+
+    def restore_bookkeeping(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`bookkeeping`
+        :raises ValueError: if it is of a buffer of another size
+        """
+        if state["shape"] != list(self.rewards.shape):
+            raise ValueError(f"The buffer has (rows, environments) {list(self.rewards.shape)}, and had {state['shape']}.")
+        self._n_added = state["n_added"]
+        self.pos = self._n_added % self.n_rows
+        self.full = self._n_added >= self.buffer_size
+        self._finals.restore(state["finals"])
+
     # --- adding ------------------------------------------------------------------------------------------------------
 
     def add(  # type: ignore[override]

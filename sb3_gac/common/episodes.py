@@ -98,6 +98,18 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         super().reset()
         self._forget_episodes()
 
+    def bookkeeping(self) -> dict[str, Any]:
+        """See :meth:`CompactDictReplayBuffer.bookkeeping`."""
+        return super().bookkeeping() | {"episodes": self._episodes.since(0), "starts": self._episode_starts.copy()}
+
+    def restore_bookkeeping(self, state: dict[str, Any]) -> None:
+        """See :meth:`CompactDictReplayBuffer.restore_bookkeeping`."""
+        super().restore_bookkeeping(state)
+        self._episodes = EpisodeIndex()
+        for episode in state["episodes"].tolist():
+            self._episodes.append(*episode)
+        self._episode_starts = state["starts"]
+
     def add(  # type: ignore[override]
         self,
         obs: Mapping[str, np.ndarray],

@@ -23,14 +23,14 @@ from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_seque
 from sb3_gac.common.heads import check_action_space, resolve_target_entropy
 from sb3_gac.common.parallel import has_side_effects
 from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
+from sb3_gac.common.resuming import ResumableAlgorithm
 from sb3_gac.common.roles import RoleKeys, resolve_lr_scales, resolve_role_keys
-from sb3_gac.common.training import NetworkTraining
 
 ENT_COEF_START = 0.1
 ENT_COEF_BOUNDS = (1e-8, 1e4)
 
 
-class AsymmetricOffPolicyAlgorithm(NetworkTraining):
+class AsymmetricOffPolicyAlgorithm(ResumableAlgorithm):
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
 
