@@ -13,9 +13,18 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
+import sb3_gac
 from sb3_gac import GAC, AsymmetricSAC, Learner, export_learner
-from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
+from sb3_gac.common.networks import VectorExtractor
+from sb3_gac.envs import History
+from sb3_gac.verification import ExportError, draw_observations
+from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
+from tests.sb3_contract.helpers import Renamed
 
+VECTOR = spaces.Box(-1, 1, (2,), np.float32)
+IMAGE = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=VECTOR)
+SEVERAL = spaces.Dict(partial=VECTOR, privileged=VECTOR, proprio=spaces.Box(-np.inf, np.inf, (3,), np.float32))
+CNN = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}}
 RECURRENT = {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8]}
 
 
@@ -43,32 +52,42 @@ def _trained(kind, tmp_path):
         "plain": lambda: small_model(TwoViewBandit(length=5)),
         "ranges": lambda: small_model(Scaled()),
         "discrete": lambda: small_model(TwoViewChoice(length=5)),
+        "image": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN),
+        "image, shared encoder": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN | {"share_features_extractor": True}),
+        "history": lambda: small_model(
+            History(Sampled(SEVERAL), length=3, actions=True), role_keys={"learner": ["partial", "proprio"]}
+        ),
         "asymmetric": lambda: small_model(TwoViewBandit(length=5), cls=AsymmetricSAC),
     }[kind]().learn(60)
 
 
 @pytest.mark.parametrize("suffix", [".onnx", ".pt"])
-@pytest.mark.parametrize("kind", ["plain", "ranges", "discrete", "asymmetric", "normalised"])
+@pytest.mark.parametrize(
+    "kind", ["plain", "ranges", "discrete", "asymmetric", "normalised", "image", "image, shared encoder", "history"]
+)
 def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
-    """On 10,000 observations, to 1e-5; with VecNormalize, from raw observations."""
+    """On 10,000 observations, to 1e-5 or, if discrete, but for ties; with VecNormalize, from raw observations."""
     model = _trained(kind, tmp_path)
     path = export_learner(model, tmp_path / f"learner{suffix}")
-    partial = np.random.default_rng(0).normal(scale=3.0, size=(10_000, 2)).astype(np.float32)
-    seen = {"partial": partial}
+    raw = draw_observations(model.policy.deployed, None, 10_000, seed=1)
+    seen = raw
     if (vec_normalize := model.get_vec_normalize_env()) is not None:
-        seen = {"partial": vec_normalize._normalize_obs(partial, vec_normalize.obs_rms["partial"]).astype(np.float32)}
+        seen = vec_normalize.normalize_obs(raw | {"privileged": np.zeros((10_000, 1))})
     expected, _ = model.predict(seen, deterministic=True)
     if suffix == ".onnx":
-        actual = Learner.load(path).act(partial)
+        actual = Learner.load(path).act(raw)
     else:
         extra = {"sb3_gac": ""}
-        actual = th.jit.load(str(path), _extra_files=extra)(th.as_tensor(partial)).numpy()
-        assert json.loads(extra["sb3_gac"])["entries"][0]["name"] == "partial"
+        actual = th.jit.load(str(path), _extra_files=extra)(*map(th.as_tensor, raw.values())).numpy()
+        assert [entry["name"] for entry in json.loads(extra["sb3_gac"])["entries"]] == list(raw)
     assert actual.shape == expected.shape
     if kind == "discrete":
-        assert (actual != expected).mean() < 1e-3, "but where two logits are equal to float precision"
+        logits = model.policy.deployed(model.policy.obs_to_tensor(raw)[0]).logits.detach()
+        first, second = logits.topk(2).values.T.numpy()
+        assert (actual == expected)[first - second > 1e-5].all()
+        assert (first - second > 1e-5).mean() > 0.99
     else:
-        np.testing.assert_allclose(actual, expected, atol=1e-5)
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["recurrent", "recurrent, continuous"])
@@ -78,23 +97,71 @@ def test_a_memory_is_carried_and_reset(kind, tmp_path):
     script = th.jit.load(str(export_learner(model, tmp_path / "learner.pt")))
     sequence = np.random.default_rng(0).random((20, 500, 4), dtype=np.float32)
     for _ in range(2):
-        state, scripted_state = None, th.zeros(500, learner.metadata["state_size"])
+        state, scripted_state = None, th.zeros(500, learner.metadata["memory"]["size"])
         learner.reset()
         for partial in sequence:
             expected, state = model.predict({"partial": partial}, state, deterministic=True)
             scripted, scripted_state = script(th.as_tensor(partial), scripted_state)
             for actual in (learner.act(partial), scripted.numpy()):
                 np.testing.assert_allclose(actual, expected, atol=1e-5)
+    with pytest.raises(ValueError, match=r"remembers 500 observations, but got 1: call reset\(\)"):
+        learner.act(sequence[0, 0])
+    learner.reset()
     assert learner.act(sequence[0, 0]).shape == expected.shape[1:]
 
 
 def test_what_the_file_says_of_itself(tmp_path):
     model = small_model(Scaled()).learn(20)
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx", units={"partial": "m", "action": "N m"}))
-    (entry,), action = learner.metadata["entries"], learner.metadata["action"]
-    assert (entry["name"], entry["shape"], entry["dtype"], entry["unit"]) == ("partial", [2], "float32", "m")
-    assert (action["shape"], action["low"], action["high"], action["unit"]) == ([1, 2], [-2, 0], [3, 0.5], "N m")
-    assert (learner.metadata["algorithm"], learner.metadata["state_size"]) == ("GAC", 0)
+    path = export_learner(model, tmp_path / "learner.onnx", units={"partial": "m", "action": "N m"})
+    said = Learner.load(path).metadata
+    nothing = [None, None]
+    partial = {"name": "partial", "shape": [2], "dtype": "float32", "unit": "m", "low": nothing, "high": nothing}
+    assert said["entries"] == [partial]
+    action = {"name": "action", "shape": [1, 2], "dtype": "float32", "unit": "N m", "low": [-2, 0], "high": [3, 0.5]}
+    assert said["action"] == action | {
+        "meaning": "the deterministic action, between low and high, for the environment's step()"
+    }
+    assert (said["version"], said["algorithm"]) == (sb3_gac.__version__, "GAC")
+    assert (said["memory"], said["normalised"]) == (None, [])
+    strict_json = onnx.load(path).metadata_props[0].value
+    json.loads(strict_json, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+
+def test_what_a_file_with_memory_and_choices_says(tmp_path):
+    said = Learner.load(export_learner(_trained("recurrent", tmp_path), tmp_path / "learner.onnx")).metadata
+    assert said["memory"] == {"input": "state", "output": "next_state", "size": 8, "initial": 0.0}
+    assert said["action"]["n"] == 3
+    assert said["action"]["meaning"].startswith("number of the most probable action")
+
+
+def test_entries_of_any_name(tmp_path):
+    """As those of the file's own inputs and outputs, and such as torch's buffers can't have."""
+    names = {"partial": "action", "privileged": "robot.state"}
+    env = VecNormalize(make_vec_env(lambda: Renamed(TwoViewBandit(), names), 1))
+    model = small_model(env, role_keys={"learner": list(names.values())}).learn(30)
+    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx", units={"action": "m", "action_": "N"}))
+    assert (learner.metadata["entries"][0]["unit"], learner.metadata["action"]["unit"]) == ("m", "N")
+    raw = {"action": np.ones(2), "robot.state": np.ones(1)}
+    expected, _ = model.predict(env.normalize_obs(raw), deterministic=True)
+    np.testing.assert_allclose(learner.act(raw), expected, atol=1e-5)
+
+
+def test_a_file_that_acts_otherwise_is_not_written(tmp_path):
+    """Here for an encoder that branches on values, of which a file keeps the branch that the example took."""
+    options = {"features_extractor_class": Branching, "net_arch": [16]}
+    model = small_model(TwoViewBandit(), policy_kwargs=options).learn(20)
+    for name in ("learner.onnx", "learner.pt"):
+        with pytest.raises(ExportError, match=rf"exported {name} differ from those of predict\(\) by up to \d"):
+            export_learner(model, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+class Branching(VectorExtractor):
+    """Turns features around in large batches."""
+
+    def forward(self, observations):
+        features = super().forward(observations)
+        return features if len(features) < 100 else -features
 
 
 def test_nothing_privileged_is_in_the_file(tmp_path):
@@ -136,11 +203,15 @@ print(Learner.load({str(path)!r}).act(np.zeros(2)).shape)
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
-        ({"partial": np.zeros(2), "privileged": np.zeros(1)}, "nothing else belongs on the robot"),
-        ({}, "The policy reads the entries"),
+        (
+            {"partial": np.zeros(2), "privileged": np.zeros(1)},
+            r"not read: \['privileged'\]. Nothing else belongs on the robot",
+        ),
+        ({}, r"The policy reads the entries \['partial'\]; missing: \['partial'\]"),
         (np.zeros(3), r'"partial" must have the shape \(2,\)'),
         (np.zeros((1, 1, 2)), r'"partial" must have the shape \(2,\)'),
         (np.array([0.0, np.nan]), '"partial" holds NaN'),
+        (np.array(["a", "b"]), '"partial" must be of type float32, but is <U1'),
     ],
 )
 def test_bad_observations(observation, message, tmp_path):
@@ -149,7 +220,25 @@ def test_bad_observations(observation, message, tmp_path):
         learner.act(observation)
 
 
+def test_entries_of_several_kinds_together(tmp_path):
+    """Each must be of the type and as many as the others."""
+    space = spaces.Dict(image=spaces.Box(0, 255, (3, 36, 36), np.uint8), gear=spaces.Discrete(3), privileged=VECTOR)
+    model = small_model(Sampled(space), role_keys={"learner": ["image", "gear"]}, policy_kwargs=CNN).learn(30)
+    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx"))
+    assert learner.metadata["entries"][1]["layout"] == "channels first"
+    rows = [space.sample() for _ in range(5)]
+    batch = {key: np.stack([row[key] for row in rows]) for key in ("image", "gear")}
+    np.testing.assert_allclose(learner.act(batch), model.predict(batch, deterministic=True)[0], atol=1e-5)
+    assert learner.act({key: rows[0][key] for key in batch}).shape == (1,)
+    with pytest.raises(ValueError, match=r"their rows are \{'gear': None, 'image': 5\}"):
+        learner.act(batch | {"gear": 1})
+    with pytest.raises(ValueError, match='"image" must be of type uint8, but is float64: values would be lost'):
+        learner.act(batch | {"image": batch["image"] / 255})
+
+
 def test_bad_files(tmp_path):
+    with pytest.raises(ValueError, match=r"units names \['torque'\], but the policy reads \['partial'\] and gives 'action'"):
+        export_learner(small_model(TwoViewBandit()), tmp_path / "learner.onnx", units={"torque": "N m"})
     with pytest.raises(ValueError, match=r'must end in ".onnx"'):
         export_learner(small_model(TwoViewBandit()), tmp_path / "learner.zip")
     (tmp_path / "other.onnx").write_bytes(b"something else")
@@ -158,8 +247,6 @@ def test_bad_files(tmp_path):
 
 
 def test_public_names_are_found_and_listed():
-    import sb3_gac
-
     assert set(sb3_gac.__all__) <= set(dir(sb3_gac))
     assert all(getattr(sb3_gac, name) is not None for name in sb3_gac.__all__)
     with pytest.raises(AttributeError, match="no attribute 'PPO'"):
