@@ -25,6 +25,7 @@ VECTOR = spaces.Box(-1, 1, (2,), np.float32)
 IMAGE = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=VECTOR)
 SEVERAL = spaces.Dict(partial=VECTOR, privileged=VECTOR, proprio=spaces.Box(-np.inf, np.inf, (3,), np.float32))
 CNN = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}}
+SHARED, READS_TWO = {"share_features_extractor": True}, {"learner": ["partial", "proprio"]}
 RECURRENT = {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8]}
 
 
@@ -39,41 +40,48 @@ class Scaled(TwoViewBandit):
         return super().step(np.ravel(action))
 
 
-def _trained(kind, tmp_path):
-    if kind == "normalised":
-        env = VecNormalize(make_vec_env(TwoViewBandit, 2, env_kwargs={"noise_std": 3.0}, seed=0))
-        return small_model(env).learn(60)
-    if kind == "recurrent":
-        return GAC("MultiInputGruPolicy", Recall(), learning_starts=40, batch_size=4, policy_kwargs=RECURRENT).learn(60)
-    if kind == "recurrent, continuous":
-        env = Recall(continuous=True)
-        return GAC("MultiInputLstmPolicy", env, learning_starts=40, batch_size=4, policy_kwargs=RECURRENT).learn(60)
-    return {
-        "plain": lambda: small_model(TwoViewBandit(length=5)),
-        "ranges": lambda: small_model(Scaled()),
-        "discrete": lambda: small_model(TwoViewChoice(length=5)),
-        "image": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN),
-        "image, shared encoder": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN | {"share_features_extractor": True}),
-        "history": lambda: small_model(
-            History(Sampled(SEVERAL), length=3, actions=True), role_keys={"learner": ["partial", "proprio"]}
-        ),
-        "asymmetric": lambda: small_model(TwoViewBandit(length=5), cls=AsymmetricSAC),
-    }[kind]().learn(60)
+def _normalised():
+    return VecNormalize(make_vec_env(TwoViewBandit, 2, env_kwargs={"noise_std": 3.0}, seed=0))
+
+
+def _recurrent(cell, env, **policy_kwargs):
+    options = {"learning_starts": 40, "batch_size": 4, "device": "cpu"}
+    return GAC(f"MultiInput{cell}Policy", env, policy_kwargs=RECURRENT | policy_kwargs, **options)
+
+
+KINDS = {
+    "plain": lambda: small_model(TwoViewBandit(length=5)),
+    "ranges": lambda: small_model(Scaled()),
+    "discrete": lambda: small_model(TwoViewChoice(length=5)),
+    "asymmetric": lambda: small_model(TwoViewBandit(length=5), cls=AsymmetricSAC),
+    "normalised": lambda: small_model(_normalised()),
+    "image": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN),
+    "image, shared encoder": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN | SHARED),
+    "history": lambda: small_model(History(Sampled(SEVERAL), 3, actions=True), role_keys=READS_TWO),
+}
+WITH_MEMORY = {
+    "recurrent": lambda: _recurrent("Gru", Recall()),
+    "recurrent, continuous": lambda: _recurrent("Lstm", Recall(continuous=True)),
+    "recurrent, normalised": lambda: _recurrent("Lstm", _normalised()),
+    "recurrent, image": lambda: _recurrent("Gru", Sampled(IMAGE), **CNN | SHARED),
+}
+
+
+def _normalised_as_in_training(model, raw):
+    vec_normalize = model.get_vec_normalize_env()
+    if vec_normalize is None:
+        return raw
+    return vec_normalize.normalize_obs(raw | {"privileged": np.zeros((len(raw["partial"]), 1))})
 
 
 @pytest.mark.parametrize("suffix", [".onnx", ".pt"])
-@pytest.mark.parametrize(
-    "kind", ["plain", "ranges", "discrete", "asymmetric", "normalised", "image", "image, shared encoder", "history"]
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
     """On 10,000 observations, to 1e-5 or, if discrete, but for ties; with VecNormalize, from raw observations."""
-    model = _trained(kind, tmp_path)
+    model = KINDS[kind]().learn(60)
     path = export_learner(model, tmp_path / f"learner{suffix}")
     raw = draw_observations(model.policy.deployed, None, 10_000, seed=1)
-    seen = raw
-    if (vec_normalize := model.get_vec_normalize_env()) is not None:
-        seen = vec_normalize.normalize_obs(raw | {"privileged": np.zeros((10_000, 1))})
-    expected, _ = model.predict(seen, deterministic=True)
+    expected, _ = model.predict(_normalised_as_in_training(model, raw), deterministic=True)
     if suffix == ".onnx":
         actual = Learner.load(path).act(raw)
     else:
@@ -90,24 +98,26 @@ def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["recurrent", "recurrent, continuous"])
+@pytest.mark.parametrize("kind", WITH_MEMORY)
 def test_a_memory_is_carried_and_reset(kind, tmp_path):
-    model = _trained(kind, tmp_path)
+    """500 sequences of 20 observations, twice."""
+    model = WITH_MEMORY[kind]().learn(60)
     learner = Learner.load(export_learner(model, tmp_path / "learner.onnx"))
     script = th.jit.load(str(export_learner(model, tmp_path / "learner.pt")))
-    sequence = np.random.default_rng(0).random((20, 500, 4), dtype=np.float32)
+    sequence = [draw_observations(model.policy.deployed, None, 500, seed=step) for step in range(20)]
     for _ in range(2):
         state, scripted_state = None, th.zeros(500, learner.metadata["memory"]["size"])
         learner.reset()
-        for partial in sequence:
-            expected, state = model.predict({"partial": partial}, state, deterministic=True)
-            scripted, scripted_state = script(th.as_tensor(partial), scripted_state)
-            for actual in (learner.act(partial), scripted.numpy()):
+        for raw in sequence:
+            expected, state = model.predict(_normalised_as_in_training(model, raw), state, deterministic=True)
+            scripted, scripted_state = script(th.as_tensor(raw["partial"]), scripted_state)
+            for actual in (learner.act(raw), scripted.numpy()):
                 np.testing.assert_allclose(actual, expected, atol=1e-5)
+    single = sequence[0]["partial"][0]
     with pytest.raises(ValueError, match=r"remembers 500 observations, but got 1: call reset\(\)"):
-        learner.act(sequence[0, 0])
+        learner.act(single)
     learner.reset()
-    assert learner.act(sequence[0, 0]).shape == expected.shape[1:]
+    assert learner.act(single).shape == expected.shape[1:]
 
 
 def test_what_the_file_says_of_itself(tmp_path):
@@ -128,7 +138,7 @@ def test_what_the_file_says_of_itself(tmp_path):
 
 
 def test_what_a_file_with_memory_and_choices_says(tmp_path):
-    said = Learner.load(export_learner(_trained("recurrent", tmp_path), tmp_path / "learner.onnx")).metadata
+    said = Learner.load(export_learner(WITH_MEMORY["recurrent"]().learn(60), tmp_path / "learner.onnx")).metadata
     assert said["memory"] == {"input": "state", "output": "next_state", "size": 8, "initial": 0.0}
     assert said["action"]["n"] == 3
     assert said["action"]["meaning"].startswith("number of the most probable action")
