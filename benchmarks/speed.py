@@ -129,13 +129,16 @@ def compare_wrappers(rounds: int = ROUNDS) -> dict[str, float]:
 
 def compare_deployment(sizes: tuple[int, int, int], width: int, rounds: int) -> dict[str, float]:
     """
-    :return: microseconds of one action from one observation: SB3 SAC's ``predict``, GAC's, and the exported learner's
+    :return: microseconds of one action from one observation: SB3 SAC's ``predict``, GAC's, and the exported learner's;
+        milliseconds until its file is loaded
     """
     th.set_num_threads(1)
     gac, sac = (make_model(name, sizes, 256, width) for name in ("gac", "sac"))
     observation = {key: box.sample() for key, box in SpacesOnly(*sizes).observation_space.items()}  # type: ignore[attr-defined]
     with tempfile.TemporaryDirectory() as directory:
-        learner = sb3_gac.Learner.load(sb3_gac.export_learner(gac, Path(directory) / "learner.onnx"))
+        path = sb3_gac.export_learner(gac, Path(directory) / "learner.onnx")
+        learner = sb3_gac.Learner.load(path)
+        loads = alternate({"load": timer(lambda: sb3_gac.Learner.load(path))}, repetitions=10, rounds=rounds)["load"]
     partial = observation["partial"]
     timers = {
         "sac_predict": timer(lambda: sac.predict(observation, deterministic=True)),
@@ -146,6 +149,7 @@ def compare_deployment(sizes: tuple[int, int, int], width: int, rounds: int) -> 
     return {
         **{f"{name}_microseconds": round(1e6 * float(np.median(values)), 1) for name, values in seconds.items()},
         "exported_times_faster_than_sac": round(median_ratio(seconds["sac_predict"], seconds["exported"]), 1),
+        "load_milliseconds": round(1e3 * float(np.median(loads)), 2),
     }
 
 

@@ -115,15 +115,14 @@ def export_learner(
     :param verify_on: number of observations to compare the file's actions and those of ``predict`` on, see
         :func:`sb3_gac.verification.check_agreement`
     :return: the path
-    :raises ValueError: if the suffix is another, or a unit is that of something else
+    :raises ValueError: if the suffix is another, a unit is that of something else, or the model learned under a
+        ``VecNormalize`` that it does not have any more
     :raises sb3_gac.verification.ExportError: if the file's actions are not those of ``predict``; nothing is then written
     """
     path = Path(path)
     if path.suffix not in WRITERS:
         raise ValueError(f'path must end in ".onnx" or, for TorchScript, ".pt", got {str(path)!r}.')
-    if normalizer is None and (vec_normalize := model.get_vec_normalize_env()) is not None:
-        keys = model.policy.role_keys[model.policy.roles.deployed]
-        normalizer = DeploymentNormalizer.from_vec_normalize(vec_normalize, keys)
+    normalizer = _normalizer_of(model) if normalizer is None else normalizer
     module = DeployedModule(deepcopy(model.policy.deployed), normalizer).cpu().eval().requires_grad_(False)
     metadata = json.dumps(describe(module, type(model).__name__, units or {}), allow_nan=False)
     with th.no_grad(), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as directory:
@@ -132,6 +131,18 @@ def export_learner(
         check_agreement(module.policy, written, normalizer, verify_on)
         written.replace(path)
     return path
+
+
+def _normalizer_of(model: AsymmetricOffPolicyAlgorithm) -> DeploymentNormalizer | None:
+    vec_normalize = model.get_vec_normalize_env()
+    if vec_normalize is not None:
+        return DeploymentNormalizer.from_vec_normalize(vec_normalize, model.policy.role_keys[model.policy.roles.deployed])
+    if model.trained_normalised:
+        raise ValueError(
+            "The model learned from observations that VecNormalize normalised, but was loaded without it: load it with "
+            'env=VecNormalize.load("<its statistics>", venv), or pass normalizer=DeploymentNormalizer.from_vec_normalize(...).'
+        )
+    return None
 
 
 def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> dict[str, Any]:

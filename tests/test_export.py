@@ -1,6 +1,7 @@
 """The deployed policy as a file: the same actions as predict, nothing privileged in it, and no torch to run it."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -14,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_gac
-from sb3_gac import GAC, AsymmetricSAC, Learner, export_learner
+from sb3_gac import GAC, AsymmetricSAC, DeploymentNormalizer, Learner, export_learner
 from sb3_gac.common.networks import VectorExtractor
 from sb3_gac.envs import History
 from sb3_gac.verification import ExportError, draw_observations
@@ -156,6 +157,19 @@ def test_entries_of_any_name(tmp_path):
     np.testing.assert_allclose(learner.act(raw), expected, atol=1e-5)
 
 
+def test_statistics_that_were_not_loaded_are_asked_for(tmp_path):
+    model = KINDS["normalised"]().learn(20)
+    expected = export_learner(model, tmp_path / "learner.onnx").read_bytes()
+    model.save(tmp_path / "model")
+    loaded = GAC.load(tmp_path / "model", device="cpu")
+    with pytest.raises(ValueError, match=r"VecNormalize normalised, but was loaded without it.*pass normalizer="):
+        export_learner(loaded, tmp_path / "other.onnx")
+    normalizer = DeploymentNormalizer.from_vec_normalize(model.get_vec_normalize_env())
+    assert export_learner(loaded, tmp_path / "other.onnx", normalizer).read_bytes() == expected
+    loaded = GAC.load(tmp_path / "model", env=model.get_vec_normalize_env(), device="cpu")
+    assert export_learner(loaded, tmp_path / "other.onnx").read_bytes() == expected
+
+
 def test_a_file_that_acts_otherwise_is_not_written(tmp_path):
     """Here for an encoder that branches on values, of which a file keeps the branch that the example took."""
     options = {"features_extractor_class": Branching, "net_arch": [16]}
@@ -193,21 +207,29 @@ def test_the_model_is_left_as_it_was(tmp_path):
     model.learn(20, reset_num_timesteps=False)
 
 
-def test_the_learner_needs_neither_torch_nor_gymnasium(tmp_path):
+@pytest.mark.parametrize("missing", [["torch"], ["torch", "stable_baselines3", "gymnasium", "mujoco"]])
+def test_the_learner_needs_neither_torch_nor_gymnasium(missing, tmp_path):
     path = export_learner(small_model(TwoViewBandit()).learn(20), tmp_path / "learner.onnx")
     program = f"""
-import sys
-for name in ("torch", "gymnasium", "stable_baselines3", "mujoco"):
-    sys.modules[name] = None
-import importlib.util
+import sys, importlib.util
+for name in {missing}:
+    sys.modules[name] = None  # importing it fails
 find = importlib.util.find_spec
-importlib.util.find_spec = lambda name, *args: None if name == "gymnasium" else find(name, *args)
+importlib.util.find_spec = lambda name, *args: None if name in {missing} else find(name, *args)
 from sb3_gac.learner import Learner
 import numpy as np
 print(Learner.load({str(path)!r}).act(np.zeros(2)).shape)
 """
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert result.stdout.strip() == "(1,)", result.stderr
+
+
+def test_one_module_is_all_that_the_robot_needs(tmp_path):
+    path = export_learner(small_model(TwoViewBandit()).learn(20), tmp_path / "learner.onnx")
+    shutil.copy(sys.modules[Learner.__module__].__file__, tmp_path / "learner.py")
+    without = "import sys; sys.modules['sb3_gac'] = sys.modules['torch'] = None"
+    program = f"{without}; from learner import Learner; Learner.load({str(path)!r})"
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
 
 
 @pytest.mark.parametrize(

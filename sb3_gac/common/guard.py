@@ -1,6 +1,7 @@
 """The deployment guard: predict refuses what the deployed policy does not read."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -22,6 +23,13 @@ class DeploymentGuard(BaseAlgorithm):
 
     policy: AsymmetricPolicy
     strict_deployment: bool = False
+    #: Whether it learned from observations that ``VecNormalize`` normalised: without these statistics there is no deployment
+    trained_normalised: bool = False
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        self.trained_normalised = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
+        return result
 
     def predict(
         self,
