@@ -17,6 +17,7 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy
+from sb3_gac.common.checks import check_positive
 from sb3_gac.common.memory import Memory
 from sb3_gac.common.normalization import DeploymentNormalizer
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
@@ -115,13 +116,14 @@ def export_learner(
     :param verify_on: number of observations to compare the file's actions and those of ``predict`` on, see
         :func:`sb3_gac.verification.check_agreement`
     :return: the path
-    :raises ValueError: if the suffix is another, a unit is that of something else, or the model learned under a
-        ``VecNormalize`` that it does not have any more
+    :raises ValueError: if the suffix is another, there is nothing to verify on, a unit is that of something else, or the
+        model learned under a ``VecNormalize`` that it does not have any more
     :raises sb3_gac.verification.ExportError: if the file's actions are not those of ``predict``; nothing is then written
     """
     path = Path(path)
     if path.suffix not in WRITERS:
         raise ValueError(f'path must end in ".onnx" or, for TorchScript, ".pt", got {str(path)!r}.')
+    check_positive("verify_on", verify_on)
     normalizer = _normalizer_of(model) if normalizer is None else normalizer
     module = DeployedModule(deepcopy(model.policy.deployed), normalizer).cpu().eval().requires_grad_(False)
     metadata = json.dumps(describe(module, type(model).__name__, units or {}), allow_nan=False)

@@ -268,7 +268,31 @@ def test_entries_of_several_kinds_together(tmp_path):
         learner.act(batch | {"image": batch["image"] / 255})
 
 
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(-1, 1, (2, 3), np.float64),
+        spaces.Box(-np.inf, np.inf, (2,), np.float16),
+        spaces.Box(np.float32(-3.4e38), np.float32(3.4e38), (2,), np.float32),
+        spaces.Box(0, 9, (2,), np.int32),
+        spaces.Discrete(4),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.MultiBinary(3),
+    ],
+    ids=str,
+)
+def test_entries_of_any_kind(space, tmp_path):
+    """Verified at export, on observations of that kind."""
+    model = small_model(Sampled(spaces.Dict(partial=space, privileged=VECTOR)))
+    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx"))
+    export_learner(model, tmp_path / "learner.pt")
+    drawn = draw_observations(model.policy.learner, None, 1)["partial"][0]
+    np.testing.assert_allclose(learner.act(drawn), model.predict({"partial": drawn}, deterministic=True)[0], atol=1e-5)
+
+
 def test_bad_files(tmp_path):
+    with pytest.raises(ValueError, match="verify_on must be a number > 0, got 0"):
+        export_learner(small_model(TwoViewBandit()), tmp_path / "learner.onnx", verify_on=0)
     with pytest.raises(ValueError, match=r"units names \['torque'\], but the policy reads \['partial'\] and gives 'action'"):
         export_learner(small_model(TwoViewBandit()), tmp_path / "learner.onnx", units={"torque": "N m"})
     with pytest.raises(ValueError, match=r'must end in ".onnx"'):
