@@ -48,11 +48,15 @@ class DeploymentGuard(BaseAlgorithm):
         :return: action in the environment's range, and the state for the next call
         :raises ValueError: if an entry is missing; with ``strict_deployment``, if there is one that the policy does not read
         """
+        if self.strict_deployment and isinstance(observation, Mapping):
+            self._refuse_unread(observation)
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def _refuse_unread(self, observation: Mapping[str, np.ndarray]) -> None:
         reads = self.policy.deployed.observation_space.spaces  # type: ignore[attr-defined]
-        unread = [key for key in observation if key not in reads] if isinstance(observation, Mapping) else []
-        if self.strict_deployment and unread:
+        unread = [key for key in observation if key not in reads]
+        if unread:
             raise ValueError(
                 f"strict_deployment=True: the policy reads {list(reads)}, but the observation passed to predict() also has "
                 f"{unread}. Nothing else belongs where the policy is deployed: leave them out."
             )
-        return super().predict(observation, state, episode_start, deterministic)
