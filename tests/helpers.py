@@ -110,6 +110,32 @@ class Recall(gym.Env):
         return {"partial": partial, "privileged": np.eye(3, dtype=np.float32)[self._cue]}
 
 
+class Sampled(gym.Env):
+    """
+    Observations are drawn from their space; the reward is the action's first number, the smaller the better.
+
+    :param observation_space: Dict
+    :param action_space: Box or Discrete, by default a Box of one number
+    :param length: steps per episode
+    """
+
+    def __init__(self, observation_space: spaces.Dict, action_space: spaces.Space | None = None, length: int = 5):
+        self.observation_space = observation_space
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32) if action_space is None else action_space
+        self.length = length
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
+        super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
+        self._step = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict]:
+        self._step += 1
+        return self.observation_space.sample(), -float(np.ravel(action)[0]), self._step >= self.length, False, {}
+
+
 def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
     """A model whose gradient steps take a few milliseconds."""
     defaults = {

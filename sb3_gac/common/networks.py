@@ -96,7 +96,8 @@ class RoleModel(BaseModel):
             leading = list(next(iter(entries.values())).shape[:2])
             entries = {key: value.flatten(0, 1) for key, value in entries.items()}
         features = extractor(preprocess_obs(entries, space, normalize_images=self.normalize_images))
-        return features.unflatten(0, leading) if leading else features
+        # not unflatten, which ONNX would do for the example's batch alone
+        return features.reshape(*leading, -1) if leading else features
 
 
 class Head(nn.Linear):

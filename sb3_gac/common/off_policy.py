@@ -20,6 +20,7 @@ from sb3_gac.common.checks import (
 )
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
 from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_sequences
+from sb3_gac.common.guard import DeploymentGuard
 from sb3_gac.common.heads import check_action_space, resolve_target_entropy
 from sb3_gac.common.parallel import has_side_effects
 from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
@@ -30,7 +31,7 @@ ENT_COEF_START = 0.1
 ENT_COEF_BOUNDS = (1e-8, 1e4)
 
 
-class AsymmetricOffPolicyAlgorithm(ResumableAlgorithm):
+class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
 

@@ -90,6 +90,7 @@ def test_an_exported_learner_beside_predict():
     row = compare_deployment((2, 3, 1), width=8, rounds=2)
     assert 0 < row["exported_microseconds"] < row["gac_predict_microseconds"]
     assert row["exported_times_faster_than_sac"] > 1
+    assert row["load_milliseconds"] > 0
 
 
 def test_a_steps_parts_add_up():
