@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
     from sb3_gac.common.buffers import CompactDictReplayBuffer
     from sb3_gac.common.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
+    from sb3_gac.common.divergence import DivergenceError
+    from sb3_gac.common.env_guard import EnvironmentFailedError, InvalidStepError
     from sb3_gac.common.episodes import EpisodeReplayBuffer
     from sb3_gac.common.normalization import DeploymentNormalizer
     from sb3_gac.export import export_learner
@@ -32,11 +34,14 @@ _WHERE = {
     "AsymmetricSAC": "baselines.asymmetric_sac",
     "CompactDictReplayBuffer": "common.buffers",
     "DeploymentNormalizer": "common.normalization",
+    "DivergenceError": "common.divergence",
+    "EnvironmentFailedError": "common.env_guard",
     "EpisodeReplayBuffer": "common.episodes",
     "GACPolicy": "gac.policies",
     "GACShare": "gac.ablations",
     "GACWithoutQ": "gac.ablations",
     "GuiderLearnerEvalCallback": "common.callbacks",
+    "InvalidStepError": "common.env_guard",
     "Learner": "learner",
     "SeededEvalCallback": "common.callbacks",
     "export_learner": "export",
@@ -60,11 +65,14 @@ __all__ = [
     "AsymmetricSAC",
     "CompactDictReplayBuffer",
     "DeploymentNormalizer",
+    "DivergenceError",
+    "EnvironmentFailedError",
     "EpisodeReplayBuffer",
     "GACPolicy",
     "GACShare",
     "GACWithoutQ",
     "GuiderLearnerEvalCallback",
+    "InvalidStepError",
     "Learner",
     "SeededEvalCallback",
     "__version__",
