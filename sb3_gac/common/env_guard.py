@@ -2,7 +2,8 @@
 
 import traceback
 from collections.abc import Callable
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,8 @@ class EnvironmentGuard:
         if isinstance(self.base, DummyVecEnv) and "_save_obs" not in vars(self.base):
             self._save_obs = self.base._save_obs
             vars(self.base)["_save_obs"] = self.save_obs
+        if isinstance(self.base, SubprocVecEnv) and type(self.base.processes[0]).__name__ == "ForkProcess":
+            self.base.remotes = tuple(map(WatchedPipe, self.base.remotes, self.base.processes))
 
     # --- in the place of the environments' own ------------------------------------------------------------------------
 
@@ -113,7 +116,7 @@ class EnvironmentGuard:
         entries = entries_of(observation)
         for key, space in self._base_spaces.items():
             value = entries.get(key)
-            if not (isinstance(value, np.ndarray) and value.shape == space.shape and _comes_in(value.dtype, space.dtype)):
+            if not (isinstance(value, np.ndarray) and value.shape == space.shape and value.dtype == space.dtype):
                 _check_entries(entries, {key: space}, index)
         self._save_obs(index, observation)
 
@@ -135,28 +138,55 @@ class EnvironmentGuard:
         except FAULTS:
             raise
         except Exception as error:
-            raise self._explained(error) from error
+            fault = self._explained(error)
+            if fault is None:
+                raise
+            raise fault from error
 
-    def _explained(self, error: Exception) -> Exception:
-        """What to raise instead of an error that came out of the environments."""
+    def _explained(self, error: Exception) -> Exception | None:
+        """What to raise instead of an error that came out of an environment; ``None`` if it came from elsewhere."""
         if isinstance(self.base, SubprocVecEnv) and isinstance(error, (EOFError, OSError)):
             self._failure = _end_processes(self.base)
             return EnvironmentFailedError(self._failure)
-        index = None
         for frame, _ in traceback.walk_tb(error.__traceback__):  # SB3's own loops know which environment they are at
             if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
-                index = frame.f_locals["env_idx"]
+                return EnvironmentFailedError(
+                    f"Environment {frame.f_locals['env_idx']} raised {type(error).__name__}: {error} {KEPT}: mend the "
+                    f"environment; {GO_ON}, or set_env(...) first gives the model another one."
+                )
             if frame.f_code.co_name == "_stack_obs":
                 for number, observation in enumerate(frame.f_locals["obs_list"]):
                     try:
                         _check_entries(observation, self._base_spaces, number)
                     except InvalidStepError as fault:
                         return fault
-        name = "The vectorised environment" if index is None else f"Environment {index}"
-        return EnvironmentFailedError(
-            f"{name} raised {type(error).__name__}: {error} {KEPT}: mend the environment; {GO_ON}, or set_env(...) first "
-            "gives the model another one."
-        )
+        return None
+
+
+class WatchedPipe:
+    """
+    A pipe to a forked process. One that was forked earlier holds the far end open as well, so that a death does not show in
+    the pipe, and whoever waits for an answer would wait for ever.
+
+    :param pipe: to it
+    :param process: at its far end
+    """
+
+    def __init__(self, pipe: Connection, process: BaseProcess):
+        self._pipe, self._process = pipe, process
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._pipe, name)
+
+    def recv(self) -> Any:
+        """
+        :return: what the process sends
+        :raises EOFError: if it has died
+        """
+        while not self._pipe.poll(PATIENCE):
+            if not self._process.is_alive() and not self._pipe.poll():
+                raise EOFError
+        return self._pipe.recv()
 
 
 def _entry_spaces(space: spaces.Space) -> dict[str, spaces.Space]:

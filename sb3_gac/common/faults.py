@@ -84,12 +84,13 @@ class FaultTolerance(OffPolicyAlgorithm):
 
     @contextmanager
     def _step_named(self) -> Iterator[None]:
-        """A fault ends the episode: the next ``learn()`` resets the environments and keeps the rest."""
+        """An error ends the episode: the next ``learn()`` resets the environments and keeps the rest."""
         try:
             yield
-        except FAULTS as fault:
+        except Exception as error:
             self._last_obs = None
-            fault.args = (f"{fault} It happened after {self.num_timesteps} steps (num_timesteps).",)
+            if isinstance(error, FAULTS):
+                error.args = (f"{error} It happened after {self.num_timesteps} steps (num_timesteps).",)
             raise
 
 
