@@ -25,10 +25,13 @@ LARGEST_SEED = 2**32 - 1
 SWITCHES = ("optimize_memory_usage", "compile", "mixed_precision")
 
 
-def check_device(device: Any) -> None:
+def check_what_construction_needs(device: Any, verbose: Any) -> None:
     """
-    :raises ValueError: unless torch has such a device
+    What SB3's constructor uses before :func:`check_shared_arguments` can look at it.
+
+    :raises ValueError: unless torch has such a device, and ``verbose`` is a number
     """
+    check_integer("verbose", verbose, 0)
     try:
         th.device("cpu" if device == "auto" else device)
     except (RuntimeError, TypeError):
@@ -54,9 +57,9 @@ def check_shared_arguments(model: OffPolicyAlgorithm) -> None:
     check_integer("n_steps", model.n_steps, 1)
     check_integer("target_update_interval", values["target_update_interval"], 1)
     check_integer("stats_window_size", model._stats_window_size, 1)
-    check_integer("verbose", model.verbose, 0)
     if model.seed is not None:
         check_integer("seed", model.seed, 0, LARGEST_SEED, remedy="or None")
+        model.seed = int(model.seed)  # Python's generator takes no integer of numpy's
     if values["max_grad_norm"] is not None:
         check_positive("max_grad_norm", values["max_grad_norm"], remedy="or None for no clipping")
     for name in SWITCHES:

@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from typing_extensions import Self
 
-from sb3_gac.common.arguments import check_device, check_shared_arguments
+from sb3_gac.common.arguments import check_shared_arguments, check_what_construction_needs
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
 from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_sequences
@@ -107,7 +107,7 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        check_device(device)
+        check_what_construction_needs(device, verbose)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -183,6 +183,8 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         if not (isinstance(self.policy_class, type) and issubclass(self.policy_class, AsymmetricPolicy)):
             names = list(self.policy_aliases)
             raise ValueError(f"policy must be one of {names} or a subclass of their classes, got {self.policy_class!r}.")
+        if not hasattr(self, "observation_space"):
+            raise ValueError("env must be an environment, got None: load() alone can do without.")
         check_action_space(type(self).__name__, self.action_space)
         check_shared_arguments(self)
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
