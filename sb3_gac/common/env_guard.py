@@ -15,6 +15,7 @@ from sb3_gac.common.checks import entries_of, fault_of, index_bounds, is_finite
 KEPT = "Nothing of this step was stored, and all that was learned before is kept"
 GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
 GUARD = "_environment_guard"
+RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under "terminal_observation"
 REWARD = spaces.Box(-np.inf, np.inf, (), np.float32)
 PATIENCE = 2.0  # seconds that a process whose pipe has closed has to end
 
@@ -101,8 +102,10 @@ class EnvironmentGuard:
         self._check_observation(observation)
         _check_rows('The "reward"', rewards, REWARD)
         for index in np.flatnonzero(dones).tolist():
-            if infos[index].get("terminal_observation") is not None:
-                _check_entries(infos[index]["terminal_observation"], self._spaces, index, "The last observation's entry")
+            final = infos[index].get("terminal_observation")
+            if final is not None:
+                _check_entries(final, self._spaces, index, "The last observation's entry")
+                infos[index][RAW_FINAL] = final
         return observation, rewards, dones, infos
 
     def save_obs(self, index: int, observation: Any) -> None:
