@@ -289,7 +289,7 @@ def test_an_outside_reset_keeps_the_last_transition_whole():
 
 @pytest.mark.parametrize("n_steps", [0, -1])
 def test_bad_n_steps(n_steps):
-    with pytest.raises(ValueError, match="n_steps must be at least 1"):
+    with pytest.raises(ValueError, match="n_steps must be an integer >= 1"):
         small_model(n_steps=n_steps)
 
 
