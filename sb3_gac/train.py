@@ -22,7 +22,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_gac import GAC, GuiderLearnerEvalCallback, __version__, preset
+from sb3_gac import GAC, PRESETS, GuiderLearnerEvalCallback, __version__, preset
 from sb3_gac.envs import PARTIAL
 from sb3_gac.envs.mujoco import TASKS
 
@@ -71,14 +71,29 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--privileged", default="state", choices=["state", "velocity"])
     parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--envs", type=int, default=4, help="environments side by side")
-    parser.add_argument("--preset", default="small", help="arguments of GAC: small or paper")
+    parser.add_argument("--envs", type=int, help="environments side by side, by default as many as the preset is for")
+    parser.add_argument("--preset", default="small", choices=sorted(PRESETS), help="arguments of GAC")
     parser.add_argument(
         "--compile", action="store_true", help="faster gradient steps after half a minute; needs a C++ compiler"
     )
     parser.add_argument("--episodes", type=int, default=10, help="of each evaluation")
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where results go")
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    options.envs = options.envs or PRESETS[options.preset].envs
+    return options
+
+
+def gac_arguments(options: argparse.Namespace) -> dict[str, Any]:
+    """
+    :param options: see :func:`parse_arguments`
+    :return: the preset's keyword arguments of GAC for this task and noise, and what the command line says on top
+    """
+    buffer_size = min(1_000_000, max(options.steps, 1_000))
+    setting = {"task": options.task, "noise": options.noise}
+    arguments = preset(options.preset, **setting, buffer_size=buffer_size, compile=options.compile)
+    if options.privileged != "state":
+        arguments["role_keys"] = None  # without the whole state in one entry, critics need all entries
+    return arguments
 
 
 def evaluate(policy: Any, env: VecEnv, episodes: int) -> tuple[float, float]:
@@ -118,11 +133,11 @@ def draw_learning_curve(history: list[dict[str, float]], title: str, path: Path)
     plt.close(figure)
 
 
-def resolved_configuration(options: argparse.Namespace, gac_arguments: dict[str, Any]) -> dict[str, Any]:
+def resolved_configuration(options: argparse.Namespace, arguments: dict[str, Any]) -> dict[str, Any]:
     """All that it takes to repeat the run."""
     command_line = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
     versions = {"sb3_gac": __version__, "torch": str(th.__version__)}
-    shown = {**gac_arguments, "policy_kwargs": {key: str(value) for key, value in gac_arguments["policy_kwargs"].items()}}
+    shown = {**arguments, "policy_kwargs": {key: str(value) for key, value in arguments["policy_kwargs"].items()}}
     return {**command_line, "eval_seed": EVAL_SEED, "gac": shown, "versions": versions}
 
 
@@ -141,14 +156,12 @@ def train(options: argparse.Namespace) -> Path:
     env_id = f"sb3_gac/{options.task}-v5"
     env = make_vec_env(env_id, n_envs=options.envs, seed=options.seed, env_kwargs=env_kwargs)
     eval_env = make_vec_env(env_id, n_envs=min(5, options.episodes), env_kwargs=env_kwargs)
-    gac_arguments = preset(options.preset, buffer_size=min(1_000_000, max(options.steps, 1_000)), compile=options.compile)
-    if options.privileged != "state":
-        gac_arguments["role_keys"] = None  # without the whole state in one entry, critics need all entries
-    configuration = resolved_configuration(options, gac_arguments)
+    arguments = gac_arguments(options)
+    configuration = resolved_configuration(options, arguments)
     (directory / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False))
 
     started = time.time()
-    model = GAC("MultiInputPolicy", env, seed=options.seed, **gac_arguments)
+    model = GAC("MultiInputPolicy", env, seed=options.seed, **arguments)
     callback = GuiderLearnerEvalCallback(
         eval_env,
         eval_seed=EVAL_SEED,

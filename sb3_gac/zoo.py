@@ -6,7 +6,8 @@ rl_zoo3 with the algorithms of this package::
     python -m sb3_gac.zoo enjoy --algo gac --env sb3_gac/HalfCheetah-v5 --folder logs
     python -m sb3_gac.zoo record_video --algo gac --env sb3_gac/HalfCheetah-v5 --folder logs
 
-Every option is rl_zoo3's.  Hyperparameters come from ``sb3_gac/zoo_hyperparams`` unless ``--conf-file`` names others.
+Every option is rl_zoo3's, and so are its own algorithms (``--algo ppo``).  Ours have their hyperparameters from
+``sb3_gac/zoo_hyperparams`` unless ``--conf-file`` names others.
 """
 
 import argparse
@@ -104,16 +105,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     own, options = parser.parse_known_args(list(sys.argv[1:] if arguments is None else arguments)[:1])
     options = list(sys.argv[2:] if arguments is None else arguments[1:])
     register()
-    if own.script == "train" and not {"-conf", "--conf-file"} & set(options):
-        options += ["--conf-file", str(HYPERPARAMS / f"{_algorithm(options)}.yml")]
+    if own.script == "train":
+        options = with_hyperparameters(options)
     sys.argv = [f"{sys.argv[0]} {own.script}", *options]
     SCRIPTS[own.script]()
 
 
-def _algorithm(options: list[str]) -> str:
+def with_hyperparameters(options: list[str]) -> list[str]:
+    """
+    :param options: of rl_zoo3's ``train``
+    :return: with ``--conf-file`` added if they name an algorithm of this package and no such file
+    """
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--algo", default="gac", choices=list(ALGORITHMS))
-    return parser.parse_known_args(options)[0].algo
+    parser.add_argument("--algo")
+    parser.add_argument("-conf", "--conf-file")
+    known, _ = parser.parse_known_args(options)
+    if known.conf_file is not None or known.algo not in ALGORITHMS:
+        return options
+    return [*options, "--conf-file", str(HYPERPARAMS / f"{known.algo}.yml")]
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from sb3_gac import GAC
-from sb3_gac.train import PartialOnly, parse_arguments, train
+from sb3_gac.train import PartialOnly, gac_arguments, parse_arguments, train
 
 
 def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_path, capsys):
@@ -39,8 +39,20 @@ def test_the_learner_is_evaluated_on_partial_alone():
     assert seen == [{"partial": 1}]
 
 
-@pytest.mark.parametrize("arguments", [["--task", "Cheetah"], ["--privileged", "all"]])
+@pytest.mark.parametrize("arguments", [["--task", "Cheetah"], ["--privileged", "all"], ["--preset", "large"]])
 def test_unknown_choices_are_refused(arguments, capsys):
     with pytest.raises(SystemExit):
         parse_arguments(arguments)
     assert "invalid choice" in capsys.readouterr().err
+
+
+def test_a_preset_brings_its_number_of_environments():
+    options = parse_arguments(["--preset", "paper"])
+    assert gac_arguments(options)["gradient_steps"] / options.envs == 0.5, "gradient steps per environment step"
+    assert parse_arguments([]).envs == 4
+    assert parse_arguments(["--preset", "paper", "--envs", "2"]).envs == 2
+
+
+def test_much_noise_has_the_target_kl_of_the_figures():
+    assert gac_arguments(parse_arguments(["--noise", "0.3"]))["target_kl"] == 0.001
+    assert "target_kl" not in gac_arguments(parse_arguments(["--noise", "0.1"])), "the default"

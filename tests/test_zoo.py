@@ -11,7 +11,7 @@ import yaml
 pytest.importorskip("rl_zoo3")
 
 from sb3_gac import envs
-from sb3_gac.zoo import ALGORITHMS, HYPERPARAMS, convert
+from sb3_gac.zoo import ALGORITHMS, HYPERPARAMS, convert, with_hyperparameters
 
 ENV = "sb3_gac/InvertedDoublePendulum-v5"
 QUICK = ["learning_starts:20", "batch_size:8", "policy_kwargs:dict(net_arch=[8])", "n_envs:1", "gradient_steps:1"]
@@ -79,6 +79,47 @@ def test_sampled_values_become_arguments():
     sampled = {"one_minus_gamma": 0.01, "batch_size_pow": 7, "net_arch": "small", "tau": 0.01}
     assert convert(sampled) == {"gamma": 0.99, "batch_size": 128, "policy_kwargs": {"net_arch": [128, 128]}, "tau": 0.01}
     assert sampled["net_arch"] == "small", "left as the trial stored it"
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_our_algorithms_have_our_hyperparameters(algorithm):
+    for options in (["--algo", algorithm, "-n", "5"], ["-n", "5", f"--algo={algorithm}"]):
+        assert with_hyperparameters(options) == [*options, "--conf-file", str(HYPERPARAMS / f"{algorithm}.yml")]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--algo", "gac", "--conf-file", "my.yml"],
+        ["--algo", "gac", "--conf-file=my.yml"],
+        ["--algo", "gac", "-conf", "my.yml"],
+        ["--algo", "gac", "--conf", "my.yml"],
+        ["--algo", "ppo", "--env", "CartPole-v1"],
+        ["--env", "CartPole-v1"],
+    ],
+)
+def test_a_file_of_ones_own_and_other_algorithms_are_left_to_the_zoo(options):
+    assert with_hyperparameters(options) == options
+
+
+def test_the_zoos_own_algorithms_train(tmp_path):
+    options = (
+        "train",
+        "--algo",
+        "ppo",
+        "--env",
+        "CartPole-v1",
+        "-n",
+        "64",
+        "-params",
+        "n_envs:1",
+        "n_steps:32",
+        "batch_size:32",
+    )
+    command = [sys.executable, "-m", "sb3_gac.zoo", *options]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr[-4000:]
+    assert (tmp_path / "logs" / "ppo").is_dir()
 
 
 def test_every_registered_task_has_hyperparameters():

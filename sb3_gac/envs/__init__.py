@@ -1,16 +1,10 @@
 """Environments and wrappers that return ``partial`` and ``privileged``; importing it registers ``sb3_gac/*``."""
 
+from sb3_gac.envs.actions import FlattenMultiDiscrete
 from sb3_gac.envs.mujoco import make_mujoco, register_mujoco
 from sb3_gac.envs.popgym import make_popgym, register_popgym
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
-from sb3_gac.envs.wrappers import (
-    FlattenMultiDiscrete,
-    History,
-    PreviousAction,
-    SensorNoise,
-    SplitDictObservation,
-    SplitObservation,
-)
+from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDictObservation, SplitObservation
 
 register_mujoco()
 register_popgym()

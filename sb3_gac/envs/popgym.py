@@ -12,8 +12,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_gac.envs.actions import FlattenMultiDiscrete
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
-from sb3_gac.envs.wrappers import FlattenMultiDiscrete, Observation, PreviousAction, reset_with
+from sb3_gac.envs.wrappers import Observation, PreviousAction, reset_with
 
 LEVELS = ("Easy", "Medium", "Hard")
 

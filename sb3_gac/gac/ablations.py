@@ -11,14 +11,21 @@ from sb3_gac.gac.update import StepInputs
 
 
 class GACShare(GAC):
-    """GAC_share: the learner climbs the guided critics (eq. 16 with Q_theta); it has none of its own."""
+    """
+    GAC_share: the learner climbs the guided critics (eq. 16 with Q_theta); it has none of its own.
+
+    ``learner_kl_scale="auto"`` is 1 whatever the guider: the pull is part of what is compared.
+    """
+
+    def _auto_learner_pull(self) -> float:
+        return 1.0
 
     def _policy_options(self) -> dict[str, Any]:
         return super()._policy_options() | {"learner_critics": False}
 
 
 class GACWithoutQ(GACShare):
-    """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14)."""
+    """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14, whatever ``learner_kl_scale``)."""
 
     def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
         return distillation_loss(now.guider.detach().kl(now.learner, self.kl_reduction), inputs.batch.mask)

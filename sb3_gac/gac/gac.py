@@ -40,8 +40,8 @@ class GAC(GuidedUpdate):
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
         is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
         learner: a pull towards it closes no gap, and the learner chases what moves along with it
-    :param learner_entropy: SAC's entropy term in the learner's objective and critics, without which its mean drifts
-        into saturation; False for eqs. 15 and 16 as printed
+    :param learner_entropy: SAC's entropy term in the learner's objective and critics; False for eqs. 15 and 16 as printed,
+        where nothing but the KL keeps the learner's mean from growing
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -149,9 +149,8 @@ class GAC(GuidedUpdate):
             check_positive("max_kl", self.max_kl, remedy="or None for no hard bound")
             if not isinstance(self.action_space, spaces.Box):
                 raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
-        if self.learner_kl_scale == "auto":
-            self.learner_kl_scale = 0.0 if self.guider == "residual" else 1.0
-        check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
+        if self.learner_kl_scale != "auto":
+            check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
 
     def _policy_options(self) -> dict[str, Any]:
         return super()._policy_options() | {

@@ -45,12 +45,13 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     compiled_settings = (
         *AsymmetricOffPolicyAlgorithm.compiled_settings,
         "kl_reduction",
-        "learner_kl_scale",
+        "learner_pull",
         "learner_entropy",
     )
     policy: GACPolicy
     kl_coef_dual: Coefficient
     kl_reduction: str
+    guider: str
     target_kl_schedule: FloatSchedule
     learner_kl_scale: str | float
     learner_entropy: bool
@@ -72,6 +73,14 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     def current_target_kl(self) -> float:
         """The bound on KL at this point of training."""
         return self.target_kl_schedule(self._current_progress_remaining)
+
+    @property
+    def learner_pull(self) -> float:
+        """Weight of the KL in the learner's objective, as a multiple of ``kl_coef``."""
+        return self._auto_learner_pull() if self.learner_kl_scale == "auto" else float(self.learner_kl_scale)
+
+    def _auto_learner_pull(self) -> float:
+        return 0.0 if self.guider == "residual" else 1.0
 
     def _run_policies(self, batch: Batch) -> StepInputs:
         (guider, next_guider), (learner, next_learner) = self._run_halves(
@@ -171,8 +180,8 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         """
         q, log_prob = now.learner.expectation(inputs.batch.values_at(self.policy.critic), noise)
         kl: th.Tensor | float = 0.0
-        if self.learner_kl_scale:
-            kl = float(self.learner_kl_scale) * now.guider.detach().kl(now.learner, self.kl_reduction)
+        if self.learner_pull:
+            kl = self.learner_pull * now.guider.detach().kl(now.learner, self.kl_reduction)
         return learner_loss(kl, q, inputs.kl_coef, log_prob, self._learner_ent_coef(inputs), inputs.batch.mask)
 
     def _learner_ent_coef(self, inputs: StepInputs) -> th.Tensor | float:

@@ -22,7 +22,7 @@ from benchmarks.config import instantiate, read_algorithm, resolve
 from benchmarks.launch import jobs_left
 from benchmarks.run import environment, run
 from benchmarks.suite import RunSpec, read_preset, read_suite
-from sb3_gac import GAC, preset
+from sb3_gac import GAC
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "benchmarks" / "suites" / "smoke.yml"
@@ -254,11 +254,6 @@ def test_every_algorithm_fits_every_preset():
             env = gym.make("sb3_gac/InvertedDoublePendulum-v5")
             settings = {"policy": "MultiInputPolicy", **instantiate(arguments), "buffer_size": 1_000, "device": "cpu"}
             algorithm_class(env=env, **settings)
-
-
-def test_the_librarys_small_preset_is_the_benchmarks():
-    _, arguments = resolve(RunSpec("gac", "Ant", 0.1, 0, 1000, 4, "small", 500, 1))
-    assert {**preset("small"), "buffer_size": 1000} == arguments
 
 
 KILLS = 10  # of each program

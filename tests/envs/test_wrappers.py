@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from sb3_gac.envs import History, SensorNoise, SplitDictObservation, SplitObservation
+from sb3_gac.envs import FlattenMultiDiscrete, History, SensorNoise, SplitDictObservation, SplitObservation
 
 
 def _box(*shape, dtype=np.float32):
@@ -148,7 +148,12 @@ def test_goes_on_after_pickling_as_if_it_had_not_been_pickled(space, wrap):
     assert _same(env.reset()[0], copy.reset()[0])
 
 
-@chains
+def _number_actions(env):
+    env.action_space = spaces.MultiDiscrete([2, 3])
+    return FlattenMultiDiscrete(env)
+
+
+@pytest.mark.parametrize(("space", "wrap"), [*CHAINS.values(), (FLAT, _number_actions)], ids=[*CHAINS, "numbered actions"])
 @pytest.mark.parametrize("given", [{}, {"seed": 3}, {"options": {"a": 1}}, {"seed": 3, "options": {"a": 1}}])
 def test_passes_on_only_the_reset_keywords_it_was_given(space, wrap, given):
     env = wrap(Fake(space))

@@ -1,7 +1,5 @@
 """GAC's gradient step against an independent computation, what it learns, what it logs, and what it refuses."""
 
-import math
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,11 +7,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_gac import GAC, GACShare, GACWithoutQ, preset
-from sb3_gac.common.distributions import TanhGaussian
-from sb3_gac.common.training import Batch
-from sb3_gac.gac.policies import ActionDistributions
-from sb3_gac.gac.update import StepInputs
+from sb3_gac import GAC, GACShare, GACWithoutQ
+from tests.gac.helpers import learner_inputs
 from tests.helpers import TwoViewBandit, small_model
 
 LOGGED = {
@@ -26,12 +21,6 @@ LOGGED = {
 
 def _numpy_state(policy):
     return {name: p.detach().double().numpy() for name, p in policy.named_parameters()}
-
-
-def _inputs(obs, kl_coef=1.0, ent_coef=1.0):
-    """Of a gradient step, as far as the learner's loss looks at them."""
-    batch = Batch(obs, None, None, obs, None, 0.99)
-    return StepInputs(batch, None, None, None, th.tensor(kl_coef), th.tensor(ent_coef))
 
 
 def _mlp(x, weights, prefix, heads):
@@ -247,15 +236,6 @@ def test_time_limits_bootstrap_and_terminations_do_not(truncate):
         assert critic(obs, th.zeros(1, 1)).detach().numpy() == pytest.approx(expected, rel=0.1)
 
 
-def test_ablations_have_the_critics_that_they_should():
-    assert small_model(cls=GACShare).policy.learner_critic is None
-    share = small_model(cls=GACShare)
-    assert share.policy.critic is share.policy.guider_critic
-    full = small_model()
-    assert full.policy.critic is full.policy.learner_critic
-    assert full.critic_target is full.policy.learner_critic_target
-
-
 @pytest.mark.parametrize("learner_entropy", [True, False])
 def test_learner_objective_matches_an_independent_computation(learner_entropy):
     """Eq. 16 from the learner's distribution and its critics, in numpy."""
@@ -264,7 +244,7 @@ def test_learner_objective_matches_an_independent_computation(learner_entropy):
     with th.no_grad():  # a guider that differs from its learner
         model.policy.guider.head.mean.bias.add_(0.3)
     now, noise = model.policy.distributions(obs), th.randn(32, 1)
-    loss = model._learner_loss(_inputs(obs, kl_coef=0.7, ent_coef=0.2), now, noise).item()
+    loss = model._learner_loss(learner_inputs(obs, kl_coef=0.7, ent_coef=0.2), now, noise).item()
     tensors = (noise, now.learner.mean, now.learner.log_std.exp(), now.guider.mean)
     noise, mean, std, guider_mean = (x.detach().double().numpy() for x in tensors)
     kl = (((guider_mean - mean) / std) ** 2 / 2)[:, 0]
@@ -273,38 +253,6 @@ def test_learner_objective_matches_an_independent_computation(learner_entropy):
     q = _ensemble(x, _numpy_state(model.policy), "learner_critic").min(axis=0)
     bonus = 0.2 * _log_prob(noise, std, action) if learner_entropy else 0.0
     assert loss == pytest.approx((0.5 * 0.7 * kl + bonus - q).mean(), rel=1e-4)
-
-
-def test_without_q_the_learner_imitates_and_nothing_else():
-    model = small_model(cls=GACWithoutQ)
-    learner = TanhGaussian(th.zeros(2, 1), th.full((2, 1), math.log(0.5)))
-    guider = TanhGaussian(th.tensor([[0.2], [0.4]]), learner.log_std)
-    loss = model._learner_loss(_inputs({}), ActionDistributions(guider, learner, learner), th.randn(2, 1))
-    assert loss.item() == pytest.approx(0.5 * (0.4**2 + 0.8**2) / 2)
-
-
-@pytest.mark.parametrize("name", ["small", "paper"])
-def test_presets_train(name):
-    arguments = preset(name, learning_starts=20, batch_size=8, gradient_steps=1, buffer_size=100)
-    model = GAC("MultiInputPolicy", TwoViewBandit(), **arguments)
-    model.learn(30)
-    assert model._n_updates > 0
-
-
-def test_preset_paper_is_the_papers_table():
-    model = GAC("MultiInputPolicy", TwoViewBandit(), **preset("paper", buffer_size=1000))
-    assert (model.guider, model.batch_size, model.gradient_steps) == ("independent", 512, 64)
-    assert (model.gamma, model.tau, model.learning_rate, model.max_grad_norm) == (0.99, 0.005, 3e-4, 1.0)
-    assert model.target_entropy == -0.5
-    assert model.policy.learner.net_arch == [256, 256]
-
-
-def test_preset_merges_policy_kwargs_and_leaves_the_table_alone():
-    arguments = preset("small", policy_kwargs={"n_critics": 3})
-    assert arguments["policy_kwargs"] == {"net_arch": [128, 128], "n_critics": 3}
-    assert "n_critics" not in preset("small")["policy_kwargs"]
-    with pytest.raises(ValueError, match="preset must be one of"):
-        preset("large")
 
 
 def test_target_entropy_conventions():
@@ -330,24 +278,3 @@ def test_networks_learn_at_rates_of_their_own():
     assert rates[0] == pytest.approx(model.lr_schedule(model._current_progress_remaining))
     assert 0 < rates[0] < 1e-3
     assert np.array(rates) / rates[0] == pytest.approx([1.0, 3.0, 2.0, 5.0])
-
-
-@pytest.mark.parametrize(("guider", "scale"), [("residual", 0.0), ("independent", 1.0)])
-def test_the_pull_towards_the_guider_is_there_where_it_can_close_a_gap(guider, scale):
-    assert small_model(guider=guider).learner_kl_scale == scale
-    assert small_model(guider=guider, learner_kl_scale=0.3).learner_kl_scale == 0.3
-
-
-def test_a_residual_guiders_kl_does_not_depend_on_the_learner():
-    """Why "auto" drops the pull: move the learner as far as you like, and KL stays what it was."""
-    model = small_model()
-    obs = {"partial": th.randn(32, 2), "privileged": th.randn(32, 1)}
-    with th.no_grad():
-        model.policy.guider.head.mean.bias.fill_(0.5)
-        kls = []
-        for shift in (0.0, 3.0):
-            model.policy.learner.head.mean.bias.fill_(shift)
-            guider, learner, _ = model.policy.distributions(obs)
-            kls.append(guider.kl(learner))
-    th.testing.assert_close(*kls, rtol=1e-4, atol=1e-6)
-    assert kls[0].min() > 0.05

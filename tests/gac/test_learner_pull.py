@@ -1,0 +1,80 @@
+"""What pulls the learner towards the guider, in GAC and in its ablations."""
+
+import math
+
+import pytest
+import torch as th
+
+from sb3_gac import GAC, GACShare, GACWithoutQ
+from sb3_gac.common.distributions import TanhGaussian
+from sb3_gac.gac.policies import ActionDistributions
+from tests.gac.helpers import learner_inputs
+from tests.helpers import small_model
+
+
+@pytest.mark.parametrize(("guider", "scale"), [("residual", 0.0), ("independent", 1.0)])
+def test_the_pull_towards_the_guider_is_there_where_it_can_close_a_gap(guider, scale):
+    assert small_model(guider=guider).learner_pull == scale
+    assert small_model(guider=guider, learner_kl_scale=0.3).learner_pull == 0.3
+
+
+def test_auto_is_saved_as_given_and_follows_the_guider(tmp_path):
+    small_model().save(tmp_path / "model")
+    for guider, pull in (("residual", 0.0), ("independent", 1.0)):
+        loaded = GAC.load(tmp_path / "model", guider=guider)
+        assert (loaded.learner_kl_scale, loaded.learner_pull) == ("auto", pull)
+
+
+def test_a_residual_guiders_kl_does_not_depend_on_the_learner():
+    """Why "auto" drops the pull: move the learner as far as you like, and KL stays what it was."""
+    model = small_model()
+    obs = {"partial": th.randn(32, 2), "privileged": th.randn(32, 1)}
+    with th.no_grad():
+        model.policy.guider.head.mean.bias.fill_(0.5)
+        kls = []
+        for shift in (0.0, 3.0):
+            model.policy.learner.head.mean.bias.fill_(shift)
+            guider, learner, _ = model.policy.distributions(obs)
+            kls.append(guider.kl(learner))
+    th.testing.assert_close(*kls, rtol=1e-4, atol=1e-6)
+    assert kls[0].min() > 0.05
+
+
+def test_ablations_have_the_critics_that_they_should():
+    assert small_model(cls=GACShare).policy.learner_critic is None
+    share = small_model(cls=GACShare)
+    assert share.policy.critic is share.policy.guider_critic
+    full = small_model()
+    assert full.policy.critic is full.policy.learner_critic
+    assert full.critic_target is full.policy.learner_critic_target
+
+
+def _learner_gradient(model, obs, kl_coef):
+    now = model.policy.distributions(obs)
+    loss = model._learner_loss(learner_inputs(obs, kl_coef=kl_coef), now, th.zeros(32, 1))
+    return th.autograd.grad(loss, model.policy.learner.head.mean.bias)[0]
+
+
+@pytest.mark.parametrize("cls", [GACShare, GACWithoutQ])
+@pytest.mark.parametrize("guider", ["residual", "independent"])
+def test_ablations_keep_the_pull_whatever_the_guider(cls, guider):
+    """By hand: the KL's gradient with respect to the learner's mean is (its mean - the guider's) / std^2."""
+    model = small_model(cls=cls, guider=guider)
+    obs = {"partial": th.randn(32, 2), "privileged": th.randn(32, 1)}
+    with th.no_grad():
+        model.policy.guider.head.mean.bias.fill_(0.5)
+    now = model.policy.distributions(obs)
+    by_hand = ((now.learner.mean - now.guider.mean) / now.guider.log_std.exp() ** 2).mean().detach()
+    assert abs(by_hand) > 0.1
+    pull = _learner_gradient(model, obs, 1.0)
+    if cls is GACShare:  # which climbs critics too
+        pull = pull - _learner_gradient(model, obs, 0.0)
+    th.testing.assert_close(pull.squeeze(), by_hand, rtol=1e-4, atol=1e-5)
+
+
+def test_without_q_the_learner_imitates_and_nothing_else():
+    model = small_model(cls=GACWithoutQ)
+    learner = TanhGaussian(th.zeros(2, 1), th.full((2, 1), math.log(0.5)))
+    guider = TanhGaussian(th.tensor([[0.2], [0.4]]), learner.log_std)
+    loss = model._learner_loss(learner_inputs({}), ActionDistributions(guider, learner, learner), th.randn(2, 1))
+    assert loss.item() == pytest.approx(0.5 * (0.4**2 + 0.8**2) / 2)
