@@ -1,6 +1,7 @@
 """Environments and wrappers that return ``partial`` and ``privileged``; importing it registers ``sb3_gac/*``."""
 
 from sb3_gac.envs.mujoco import make_mujoco, register_mujoco
+from sb3_gac.envs.pendulum import make_pendulum, register_pendulum
 from sb3_gac.envs.popgym import make_popgym, register_popgym
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.wrappers import (
@@ -13,6 +14,7 @@ from sb3_gac.envs.wrappers import (
 )
 
 register_mujoco()
+register_pendulum()
 register_popgym()
 
 __all__ = [
@@ -25,7 +27,9 @@ __all__ = [
     "SplitDictObservation",
     "SplitObservation",
     "make_mujoco",
+    "make_pendulum",
     "make_popgym",
     "register_mujoco",
+    "register_pendulum",
     "register_popgym",
 ]
