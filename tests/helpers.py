@@ -101,6 +101,7 @@ class Recall(gym.Env):
 def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
     """A model whose gradient steps take a few milliseconds."""
     defaults = {
+        "policy": "MultiInputPolicy",
         "learning_starts": 10,
         "batch_size": 16,
         "buffer_size": 1000,
@@ -108,7 +109,7 @@ def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
         "device": "cpu",
         "policy_kwargs": {"net_arch": [16]},
     }
-    return cls("MultiInputPolicy", TwoViewBandit() if env is None else env, **{**defaults, **arguments})
+    return cls(env=TwoViewBandit() if env is None else env, **{**defaults, **arguments})
 
 
 def optimizers_of(policy: Any) -> list[Any]:
