@@ -286,6 +286,8 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, Any]:
+        if (reset_num_timesteps or self._last_obs is None) and isinstance(self.replay_buffer, CompactDictReplayBuffer):
+            self.replay_buffer.cut()  # the environments are about to be reset
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         assert isinstance(self._last_obs, dict)
         self._forget_episode_on_error(check_finite_observation, self._last_obs)
