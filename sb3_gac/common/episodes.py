@@ -128,6 +128,14 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
             self._episodes.append(env, self._episode_starts[env], step + 1 - self._episode_starts[env])
             self._episode_starts[env] = step + 1
 
+    @property
+    def n_episodes(self) -> int:
+        """Whole episodes that can be sampled."""
+        return len(self._whole_episodes())
+
+    def _whole_episodes(self) -> np.ndarray:
+        return self._episodes.since(self._n_added - self.size())
+
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceSamples:  # type: ignore[override]
         """
         :param batch_size: sequences, B
@@ -135,7 +143,7 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         :return: tensors on the buffer's device
         :raises ValueError: if no episode is whole
         """
-        episodes = self._episodes.since(self._n_added - self.size())
+        episodes = self._whole_episodes()
         if not len(episodes):
             raise ValueError(
                 f"The replay buffer holds no whole episode among its last {self.size() * self.n_envs} transitions: raise "

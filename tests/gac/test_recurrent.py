@@ -218,6 +218,17 @@ def test_what_recurrent_policies_cannot_have(arguments, message):
         _model(**arguments)
 
 
-def test_no_episode_to_learn_from():
-    with pytest.raises(ValueError, match="raise learning_starts above the length of an episode"):
-        _model(learning_starts=2).learn(10)
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_gradient_steps_wait_for_the_first_whole_episode_and_say_so_once(cls):
+    model = _model(cls, env=Recall(length=8), learning_starts=2)
+    with pytest.warns(UserWarning, match=r"no gradient steps until .* learning_starts=2") as warnings:
+        model.learn(12)
+    assert len([warning for warning in warnings if "no gradient steps" in str(warning.message)]) == 1
+    assert model._n_updates == 12 - 7
+
+
+def test_a_buffer_that_no_episode_fits_in_is_an_error():
+    model = _model(env=Recall(length=20), learning_starts=2, buffer_size=10)
+    with pytest.warns(UserWarning, match="no gradient steps"), pytest.raises(ValueError, match="buffer_size far above it"):
+        model.learn(15)
+    assert model.num_timesteps == 10
