@@ -76,9 +76,9 @@ def median_ratio(numerators: list[float], denominators: list[float]) -> float:
 def compare_recurrent(batch: int, width: int, threads: int, rounds: int) -> dict[str, float]:
     """
     :return: gradient steps per second of GAC with GRUs on RepeatPreviousEasy's sizes, as a multiple of a Python loop over
-        time, and their share of the limit
+        time, and their share of the limit; sampling's share of their time
     """
-    arguments = {name: (name == "looped", (8, 5, 4), 51, batch, width) for name in ("ours", "looped")}
+    arguments = {name: (name, (8, 5, 4), 51, batch, width) for name in ("ours", "looped", "sampling")}
     with process_timers(make_recurrent_step, arguments, threads) as timers:
         seconds = alternate(timers, repetitions=2, rounds=rounds)
     th.set_num_threads(threads)
@@ -87,6 +87,7 @@ def compare_recurrent(batch: int, width: int, threads: int, rounds: int) -> dict
         "ours_per_second": round(1 / float(np.median(seconds["ours"])), 2),
         "ours_over_looped": round(median_ratio(seconds["looped"], seconds["ours"]), 2),
         "share_of_limit": round(1 / float(np.median(seconds["ours"])) / limit, 3),
+        "sampling_share": round(median_ratio(seconds["sampling"], seconds["ours"]), 3),
     }
 
 

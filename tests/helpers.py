@@ -139,6 +139,7 @@ class Sampled(gym.Env):
 def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
     """A model whose gradient steps take a few milliseconds."""
     defaults = {
+        "policy": "MultiInputPolicy",
         "learning_starts": 10,
         "batch_size": 16,
         "buffer_size": 1000,

@@ -264,7 +264,9 @@ class ResumableAlgorithm(NetworkTraining):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, Any]:
-        """SB3 resets the action noise at each ``learn``, but a resumed one goes on."""
+        """Episodes do not go on across a reset; SB3 resets the action noise at each ``learn``, but a resumed one goes on."""
+        if (reset_num_timesteps or self._last_obs is None) and isinstance(self.replay_buffer, CompactDictReplayBuffer):
+            self.replay_buffer.cut()  # the environments are about to be reset
         noise, self._resumed_noise = deepcopy(self._resumed_noise), None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if noise is not None and not reset_num_timesteps:

@@ -1,5 +1,6 @@
 """The train loop, and what a gradient step is put together from."""
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -11,7 +12,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.common.compilation import Program
 from sb3_gac.common.divergence import check_finite_metrics
-from sb3_gac.common.episodes import SequenceSamples
+from sb3_gac.common.episodes import EpisodeReplayBuffer, SequenceSamples
 from sb3_gac.common.faults import FaultTolerance
 from sb3_gac.common.losses import critic_loss, masked_mean
 from sb3_gac.common.parallel import halved_threads, run_halves
@@ -107,12 +108,15 @@ class NetworkTraining(FaultTolerance):
     _halves_together = False
     #: Of the last round of gradient steps, all finite
     _last_metrics: Mapping[str, float] = MappingProxyType({})
+    _waiting = False
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """
         :param gradient_steps: number of gradient steps
         :param batch_size: transitions per step, B
         """
+        if self._waits_for_an_episode():
+            return
         self.policy.set_training_mode(True)
         self.policy.refresh_parameters()
         self._update_learning_rate(self._scheduled_optimizers())
@@ -121,6 +125,19 @@ class NetworkTraining(FaultTolerance):
         with halved_threads(self._halves_together):
             history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
         self._record_metrics(history)
+
+    def _waits_for_an_episode(self) -> bool:
+        """Whether there is nothing yet to learn from; said once. (A full buffer without a whole episode is an error.)"""
+        buffer = self.replay_buffer
+        waits = isinstance(buffer, EpisodeReplayBuffer) and not buffer.full and buffer.n_episodes == 0
+        if waits and not self._waiting:
+            warnings.warn(
+                f"There are no gradient steps until the first episode has ended, although learning_starts={self.learning_starts}"
+                " environment steps are over: a recurrent policy learns from whole episodes.",
+                stacklevel=3,
+            )
+        self._waiting = waits
+        return waits
 
     def _one_update(self, batch_size: int, diagnose: bool) -> Metrics:
         metrics = self._gradient_step(self._sample_batch(batch_size), diagnose)
