@@ -19,9 +19,10 @@ import yaml
 from rliable import library as rly
 from rliable import metrics
 
-from benchmarks.suite import HERE, RunSpec, read_cells
+from benchmarks.suite import HERE, RunSpec, made_with, read_cells
 
 CELL = ["task", "noise"]
+REFERENCE = "sac-asym"
 STEADY_FROM = 5_000
 BOOTSTRAPS = 2_000
 
@@ -65,6 +66,19 @@ def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
     """
     by_run = tidy.sort_values("timesteps").groupby([*CELL, "algorithm", "seed"], sort=False)
     return by_run.learner.agg(final="last", area="mean").reset_index()
+
+
+def choose_reference(algorithms: list[str], wanted: str | None = None) -> str:
+    """
+    :param algorithms: that there are
+    :param wanted: one of them, ``None`` for ``REFERENCE`` if it is there, else the first
+    :raises ValueError: if the one that is wanted is not there
+    """
+    if wanted is None:
+        return REFERENCE if REFERENCE in algorithms else algorithms[0]
+    if wanted not in algorithms:
+        raise ValueError(f"reference must be one of {algorithms}, got {wanted!r}.")
+    return wanted
 
 
 def summarise_cells(tidy: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
@@ -130,34 +144,72 @@ def guidance(group: pd.DataFrame) -> dict[str, float]:
     return {"guider_mean": round(float(final.guider.mean()), 1), **kl}
 
 
-def compare(tidy: pd.DataFrame) -> dict[str, Any]:
+def normalised_scores(tidy: pd.DataFrame) -> pd.DataFrame:
     """
-    Over all cells together, for the algorithms that every cell has with equally many seeds.
+    Returns of a cell between the lowest point of its curves and its best end, whatever their sign: a constant added to all of
+    them, or a positive factor, changes nothing.
 
     :param tidy: see :func:`collect`
-    :return: interquartile means of final returns over those of the best algorithm's mean in each cell, and each
-        algorithm's probability of improvement over each other, with intervals
+    :return: :func:`run_scores` with "low", the lowest mean over seeds of any algorithm at any evaluation in the cell, "high",
+        the best algorithm's mean final return there, and "normalised", the final return with the two at 0 and 1
     """
     scores = run_scores(tidy)
-    best = scores.groupby([*CELL, "algorithm"]).final.mean().groupby(CELL).max().rename("best").reset_index()
-    scores = scores.merge(best, on=CELL)
-    scores["normalised"] = scores.final / scores.best
-    cells = scores[CELL].drop_duplicates()
-    matrices = {}
-    for algorithm, group in scores.groupby("algorithm", sort=False):
-        columns = [group.merge(pd.DataFrame([cell]), on=CELL).normalised.to_numpy() for _, cell in cells.iterrows()]
-        if len({len(column) for column in columns}) == 1 and len(columns[0]):
-            matrices[str(algorithm)] = np.stack(columns, axis=1)
-    pairs = {f"{one} over {other}": (matrices[one], matrices[other]) for one in matrices for other in matrices if one != other}
-    improvements = _estimate(pairs, metrics.probability_of_improvement) if pairs else {}
+    low = tidy.groupby([*CELL, "algorithm", "timesteps"]).learner.mean().groupby(CELL).min()
+    high = scores.groupby([*CELL, "algorithm"]).final.mean().groupby(CELL).max()
+    scores = scores.merge(pd.DataFrame({"low": low, "high": high}).reset_index(), on=CELL)
+    span = (scores.high - scores.low).replace(0.0, 1.0)  # where nobody ever differs, all are the best
+    return scores.assign(normalised=1 - (scores.high - scores.final) / span)
+
+
+def compare(tidy: pd.DataFrame) -> dict[str, Any]:
+    """
+    Over all cells together, for the algorithms that every cell has, with equally many runs of each: as many as there are where
+    there are fewest, those with the first seeds.
+
+    :param tidy: see :func:`collect`
+    :return: "compared", which says what was; interquartile means of normalised final returns, and each algorithm's
+        probability of improvement over each other, with intervals
+    """
+    scores = normalised_scores(tidy)
+    counts = scores.pivot_table("seed", CELL, "algorithm", aggfunc="count")
+    names = [name for name in scores.algorithm.unique() if counts[name].notna().all()]
+    runs = int(counts[names].min().min()) if names else 0
+    compared = scores[scores.algorithm.isin(names)].sort_values("seed", kind="stable")
+    compared = compared.groupby([*CELL, "algorithm"], sort=False).head(runs)
+    matrices = {name: _runs_by_cell(compared[compared.algorithm == name]) for name in names}
+    pairs = {f"{one} over {other}": (matrices[one], matrices[other]) for one in names for other in names if one != other}
     return {
+        "compared": {
+            "algorithms": names,
+            "left_out": [name for name in scores.algorithm.unique() if name not in names],
+            "cells": _compared_cells(compared),
+        },
         "normalised_iqm": _rounded(_estimate(matrices, metrics.aggregate_iqm)),
-        "probability_of_improvement": _rounded(improvements),
+        "probability_of_improvement": _rounded(_estimate(pairs, metrics.probability_of_improvement)),
     }
+
+
+def _runs_by_cell(of_algorithm: pd.DataFrame) -> np.ndarray:
+    return np.stack([cell.normalised.to_numpy() for _, cell in of_algorithm.groupby(CELL)], axis=1)
+
+
+def _compared_cells(compared: pd.DataFrame) -> list[dict[str, Any]]:
+    """Each cell's seeds by algorithm, and the returns that count as 0 and 1."""
+    return [
+        {
+            **dict(zip(CELL, key, strict=True)),
+            "low": round(float(cell.low.iloc[0]), 3),
+            "high": round(float(cell.high.iloc[0]), 3),
+            "seeds": {str(name): group.seed.tolist() for name, group in cell.groupby("algorithm", sort=False)},
+        }
+        for key, cell in compared.groupby(CELL)
+    ]
 
 
 def _estimate(scores: dict[str, Any], metric: Callable[..., float]) -> dict[str, tuple[float, tuple[float, float]]]:
     """Point estimate and interval of a metric, the same for the same scores."""
+    if not scores:
+        return {}
 
     def as_array(*arguments: np.ndarray) -> np.ndarray:
         return np.array([metric(*arguments)])
@@ -172,18 +224,24 @@ def _rounded(estimates: dict[str, tuple[float, tuple[float, float]]]) -> dict[st
 
 def origins(suite: Path, specs: list[RunSpec], runs: Path) -> dict[str, Any]:
     """Command, commits and versions of the runs, their arguments and directories, and the hours that they took."""
+    directories = [str(spec.directory(Path())) for spec in specs]
     configurations = [yaml.safe_load((spec.directory(runs) / "config.yaml").read_text()) for spec in specs]
     seconds = [json.loads((spec.directory(runs) / "timing.json").read_text())["seconds"] for spec in specs]
+    origins_of_runs = [made_with(configuration) for configuration in configurations]
     return {
         "command": f"python -m benchmarks.launch benchmarks/suites/{suite.name}",
-        "commits": sorted({configuration["commit"] for configuration in configurations}),
-        "versions": configurations[0]["versions"],
+        "made_with": _distinct([origin for of_run in origins_of_runs for origin in of_run]),
+        "mixed_runs": [name for name, of_run in zip(directories, origins_of_runs, strict=True) if len(of_run) > 1],
         "cpus": configurations[0]["cpus"],
         "hours": round(sum(seconds) / 3600, 2),
         "seconds_per_run": {"median": round(float(np.median(seconds)), 1), "max": round(max(seconds), 1)},
         "arguments": _arguments_by_algorithm(specs, configurations),
-        "directories": [str(spec.directory(Path())) for spec in specs],
+        "directories": directories,
     }
+
+
+def _distinct(origins_of_runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [origin for index, origin in enumerate(origins_of_runs) if origin not in origins_of_runs[:index]]
 
 
 def _arguments_by_algorithm(specs: list[RunSpec], configurations: list[dict[str, Any]]) -> dict[str, Any]:
@@ -199,15 +257,17 @@ def main() -> None:
     parser.add_argument("suite", type=Path)
     parser.add_argument("--runs", type=Path, default=HERE / "runs")
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
-    parser.add_argument("--reference", default="sac-asym", help="algorithm to whose final return steps are counted")
+    parser.add_argument("--reference", help=f"to whose final return steps are counted: {REFERENCE}, or the first, by default")
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
     options = parser.parse_args()
     specs, missing = finished_runs(options.suite, options.runs, options.complete_cells)
     tidy = collect(specs, options.runs)
+    reference = choose_reference(list(tidy.algorithm.unique()), options.reference)
     results = {
         **origins(options.suite, specs, options.runs),
         "still_to_run": [str(Path(directory).relative_to(options.runs)) for directory in missing],
-        "cells": summarise_cells(tidy, options.reference),
+        "reference": reference,
+        "cells": summarise_cells(tidy, reference),
         **compare(tidy),
     }
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -24,6 +24,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#7f7f7f")
+_SHOWN_ELSEWHERE = ("cells", "normalised_iqm", "probability_of_improvement", "directories")
 STYLE = """
 body {font: 15px sans-serif; margin: 2em}
 table {border-collapse: collapse; margin: 1em 0}
@@ -47,6 +48,24 @@ def grid(tidy: pd.DataFrame) -> tuple[list[str], list[float], list[str]]:
     return list(tidy.task.unique()), sorted(tidy.noise.unique()), list(tidy.algorithm.unique())
 
 
+def palette(algorithms: list[str]) -> dict[str, str]:
+    """
+    :param algorithms: any number
+    :return: a color for each, in the same order
+    """
+    if len(algorithms) <= len(COLORS):
+        return dict(zip(algorithms, COLORS, strict=False))
+    hues = matplotlib.colormaps["hsv"]
+    return {name: matplotlib.colors.to_hex(hues(index / len(algorithms))) for index, name in enumerate(algorithms)}
+
+
+def has_guider(group: pd.DataFrame) -> bool:
+    """
+    :param group: one algorithm in one cell
+    """
+    return "guider" in group and bool(group.guider.notna().any())
+
+
 def draw(tidy: pd.DataFrame, path: Path) -> None:
     """
     Tasks across, noises down; mean and interval of the learner, dashes the guider.
@@ -61,14 +80,14 @@ def draw(tidy: pd.DataFrame, path: Path) -> None:
         for column, task in enumerate(tasks):
             axis = axes[row][column]
             cell = tidy[(tidy.task == task) & (tidy.noise == noise)]
-            for color, algorithm in zip(COLORS, algorithms, strict=False):
+            for algorithm, color in palette(algorithms).items():
                 group = cell[cell.algorithm == algorithm]
                 if group.empty:
                     continue
                 learner = curves(group)
                 axis.plot(learner.index, learner["mean"], color=color, label=algorithm, linewidth=1.8)
                 axis.fill_between(learner.index, learner.low, learner.high, color=color, alpha=0.15, linewidth=0)
-                if "guider" in group and group.guider.notna().any():
+                if has_guider(group):
                     guider = curves(group, "guider")
                     axis.plot(guider.index, guider["mean"], color=color, linestyle="--", linewidth=1)
             axis.set(title=f"{task}, noise {noise:g}", xlabel="environment steps", ylabel="return")
@@ -80,42 +99,51 @@ def draw(tidy: pd.DataFrame, path: Path) -> None:
 def interactive(tidy: pd.DataFrame) -> graph_objects.Figure:
     """
     :param tidy: as aggregated
-    :return: the same grid; a click on a name switches an algorithm off in all cells
+    :return: the same grid, with each seed's curve; a click on a name switches an algorithm off in all cells
     """
     tasks, noises, algorithms = grid(tidy)
     titles = [f"{task}, noise {noise:g}" for noise in noises for task in tasks]
     figure = make_subplots(rows=len(noises), cols=len(tasks), subplot_titles=titles)
-    named = set()
+    named: set[str] = set()
     for row, noise in enumerate(noises, start=1):
         for column, task in enumerate(tasks, start=1):
             cell = tidy[(tidy.task == task) & (tidy.noise == noise)]
-            for color, algorithm in zip(COLORS, algorithms, strict=False):
+            for algorithm, color in palette(algorithms).items():
                 group = cell[cell.algorithm == algorithm]
-                common = {"legendgroup": algorithm, "line": {"color": color}}
-                for seed, run in group.groupby("seed"):
-                    thin = {"color": color, "width": 0.7}
-                    label = f"{algorithm}, seed {seed}"
-                    line = graph_objects.Scatter(
-                        x=run.timesteps,
-                        y=run.learner,
-                        name=label,
-                        legendgroup=algorithm,
-                        line=thin,
-                        showlegend=False,
-                        opacity=0.5,
-                    )
-                    figure.add_trace(line, row, column)
                 if not group.empty:
-                    mean = curves(group)["mean"]
-                    first = algorithm not in named
-                    figure.add_trace(
-                        graph_objects.Scatter(x=mean.index, y=mean, name=algorithm, showlegend=first, **common), row, column
-                    )
+                    lines = algorithm_lines(group, algorithm, color, in_legend=algorithm not in named)
+                    figure.add_traces(lines, rows=row, cols=column)
                     named.add(algorithm)
     figure.update_layout(
         height=340 * len(noises) + 80, hovermode="closest", hoverlabel={"namelength": -1}, template="plotly_white"
     )
     return figure
+
+
+def algorithm_lines(group: pd.DataFrame, algorithm: str, color: str, in_legend: bool) -> list[graph_objects.Scatter]:
+    """
+    :param group: one algorithm in one cell
+    :param algorithm: its name
+    :param color: its color
+    :param in_legend: whether this cell's mean stands in the legend for those of all cells
+    :return: each seed's curve, the interval around the mean as a band, the mean, and the guider's mean in dashes
+    """
+
+    def line(x: Any, y: Any, name: str, showlegend: bool = False, **style: Any) -> graph_objects.Scatter:
+        style = {"mode": "lines", "line": {"color": color}, **style}
+        return graph_objects.Scatter(x=x, y=y, name=name, legendgroup=algorithm, showlegend=showlegend, **style)
+
+    thin: dict[str, Any] = {"mode": "lines+markers", "marker": {"size": 3}, "line": {"color": color, "width": 0.7}, "opacity": 0.5}
+    lines = [line(run.timesteps, run.learner, f"{algorithm}, seed {seed}", **thin) for seed, run in group.groupby("seed")]
+    learner = curves(group)
+    there, back = list(learner.index), list(learner.index[::-1])
+    band: dict[str, Any] = {"fill": "toself", "line": {"color": color, "width": 0}, "opacity": 0.15, "hoverinfo": "skip"}
+    lines.append(line(there + back, [*learner.high, *learner.low[::-1]], f"{algorithm}, 95% of the mean", **band))
+    lines.append(line(learner.index, learner["mean"], algorithm, in_legend))
+    if has_guider(group):
+        guider = curves(group, "guider")["mean"]
+        lines.append(line(guider.index, guider, f"{algorithm}, guider", line={"color": color, "width": 1, "dash": "dash"}))
+    return lines
 
 
 def cells_table(cells: list[dict[str, Any]]) -> str:
@@ -172,7 +200,7 @@ def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> 
     """
     tables = "".join(_html_table(table) for table in (cells_table(results["cells"]), overall_table(results)))
     plot = interactive(tidy).to_html(full_html=False, include_plotlyjs=True)
-    origin = {key: results[key] for key in ("command", "commits", "versions", "hours", "still_to_run", "arguments")}
+    origin = {key: value for key, value in results.items() if key not in _SHOWN_ELSEWHERE}
     logs = "".join(f"<li>{_link(f'{runs}/{directory}', directory)}</li>" for directory in results["directories"])
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}</style>'

@@ -24,15 +24,17 @@ from typing import Any
 import gymnasium
 import torch as th
 import yaml
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
 import sb3_gac
 from benchmarks.checkpoint import CheckpointCallback, load_checkpoint, locked, remove_checkpoint, write_atomically
 from benchmarks.config import instantiate, resolve
-from benchmarks.suite import HERE, RunSpec, read_suite
+from benchmarks.suite import HERE, RunSpec, made_with, read_suite
 
 EVAL_SEED = 10_000
+CONFIGURATION = "config.yaml"
 
 
 def provenance() -> dict[str, Any]:
@@ -64,48 +66,84 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     directory.mkdir(parents=True, exist_ok=True)
     with locked(directory):
         algorithm_class, arguments = resolve(spec)
-        _write_configuration(directory / "config.yaml", {"run": dataclasses.asdict(spec), "arguments": arguments})
-        history = _train(spec, directory, algorithm_class, instantiate(arguments), progress_bar)
+        configuration = {"run": dataclasses.asdict(spec), "arguments": arguments}
+        _refuse_other_settings(directory / CONFIGURATION, configuration)
+        history = _train(spec, directory, algorithm_class, configuration, progress_bar)
         write_evaluations(history, directory / "evaluations.csv")
         remove_checkpoint(directory)
     return directory
 
 
-def _write_configuration(path: Path, configuration: dict[str, Any]) -> None:
+def _refuse_other_settings(path: Path, configuration: dict[str, Any]) -> None:
     """What was written by a process that did not come to the end must have been the same: two runs are never mixed."""
     if path.exists():
         before = yaml.safe_load(path.read_text())
         changed = [key for key in configuration if before.get(key) != configuration[key]]
         if changed:
             raise ValueError(f"{path.parent} holds an unfinished run with other settings under {changed}: remove it first.")
-    write_atomically(path, yaml.safe_dump(configuration | provenance(), sort_keys=False))
+
+
+def _write_configuration(path: Path, configuration: dict[str, Any], resumed: bool) -> None:
+    """With the commit and versions of this process, and, if it goes on where others stopped, theirs where they differ."""
+    now = provenance()
+    before = made_with(yaml.safe_load(path.read_text())) if resumed else []
+    earlier = [origin for origin in before if origin not in made_with(now)]
+    write_atomically(path, yaml.safe_dump(configuration | now | {"earlier": earlier}, sort_keys=False))
+
+
+class Stopwatch(BaseCallback):
+    """
+    Seconds and steps from a run's start to its last checkpoint, in whatever processes: what a killed one did after its last
+    checkpoint is done again, and not counted.
+
+    :param path: JSON file
+    :param every: calls between two checkpoints
+    :param resumed: whether the file's seconds and steps come first
+    """
+
+    def __init__(self, path: Path, every: int, resumed: bool):
+        super().__init__()
+        self._path, self._every, self._started = path, every, time.time()
+        self._before = json.loads(path.read_text())["seconds"] if resumed and path.exists() else 0.0
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self._every == 0:
+            self.write()
+        return True
+
+    def write(self) -> None:
+        """Replace the file."""
+        spent = {"seconds": self._before + time.time() - self._started, "steps": self.model.num_timesteps}
+        write_atomically(self._path, json.dumps(spent))
 
 
 def _train(
-    spec: RunSpec, directory: Path, algorithm_class: Any, arguments: dict[str, Any], progress_bar: bool
+    spec: RunSpec, directory: Path, algorithm_class: Any, configuration: dict[str, Any], progress_bar: bool
 ) -> list[dict[str, float]]:
     """
     :return: one row per evaluation
     """
-    started = time.time()
     env_id, env_kwargs = environment(spec)
     env = make_vec_env(env_id, spec.envs, seed=spec.seed, env_kwargs=env_kwargs)
     eval_env = make_vec_env(env_id, spec.eval_episodes, env_kwargs=env_kwargs)
+    every = spec.eval_every // spec.envs
     evaluation = _evaluation_class(algorithm_class)(
-        eval_env, eval_seed=EVAL_SEED, eval_freq=spec.eval_every // spec.envs, n_eval_episodes=spec.eval_episodes, verbose=0
+        eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=spec.eval_episodes, verbose=0
     )
     checkpoint = load_checkpoint(algorithm_class, directory, env, spec.seed)
+    _write_configuration(directory / CONFIGURATION, configuration, resumed=checkpoint is not None)
+    stopwatch = Stopwatch(directory / "timing.json", every, resumed=checkpoint is not None)
     if checkpoint is None:
-        model = algorithm_class(**{"policy": "MultiInputPolicy", "env": env, **arguments, "seed": spec.seed, "device": "cpu"})
+        arguments = {"policy": "MultiInputPolicy", **instantiate(configuration["arguments"])}
+        model = algorithm_class(**{**arguments, "env": env, "seed": spec.seed, "device": "cpu"})
     else:
         model, evaluation.history = checkpoint
     model.set_logger(configure(str(directory / "tensorboard"), ["tensorboard"]))
-    callbacks = [evaluation, CheckpointCallback(directory, evaluation)]
+    callbacks = [evaluation, CheckpointCallback(directory, evaluation), stopwatch]
     left = spec.steps - model.num_timesteps
     model.learn(left, callback=callbacks, reset_num_timesteps=False, progress_bar=progress_bar)
     model.save(directory / "model")
-    seconds = {"seconds": time.time() - started, "steps": left}
-    write_atomically(directory / "timing.json", json.dumps(seconds))
+    stopwatch.write()
     return evaluation.history
 
 

@@ -62,6 +62,14 @@ class RunSpec:
         return True
 
 
+def made_with(configuration: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """
+    :param configuration: a run's ``config.yaml``
+    :return: commit and versions of the processes that made it, more than one if they differ
+    """
+    return [*configuration.get("earlier", []), {key: configuration[key] for key in ("commit", "versions")}]
+
+
 def read_suite(path: Path) -> list[RunSpec]:
     """
     :param path: YAML file

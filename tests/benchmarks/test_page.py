@@ -58,7 +58,12 @@ def _page():
         for steps in (1000, 2000)
     ]
     tidy = pd.DataFrame(rows)
-    origin = {"command": "python -m benchmarks.launch a-suite.yml", "commits": ["abc"], "versions": {"torch": "2.x"}}
+    tidy["guider"] = tidy.learner.where(tidy.algorithm == "gac") + 50
+    tidy = tidy.assign(kl=0.01, target_kl=0.01)
+    origin = {
+        "command": "python -m benchmarks.launch a-suite.yml",
+        "made_with": [{"commit": "abc", "versions": {"torch": "2"}}],
+    }
     results = origin | {"hours": 1, "still_to_run": [], "arguments": {"gac": {"tau": 0.01}}, "directories": ["small-1/a run"]}
     return page(tidy, results | {"cells": summarise_cells(tidy, "sac-asym"), **compare(tidy)}, "a page", "../runs")
 
@@ -73,7 +78,8 @@ def test_curves_tables_and_configuration_are_shown_without_errors(browser):
     from selenium.webdriver.common.by import By
 
     assert browser.title == "a page"
-    assert len(browser.find_elements(By.CSS_SELECTOR, ".scatterlayer .trace")) == 2 * 2 * 3, "two seeds and their mean"
+    drawn = len(browser.find_elements(By.CSS_SELECTOR, ".scatterlayer .trace"))
+    assert drawn == 2 * (2 * 4 + 1), "in two cells, of two algorithms two seeds, their mean and its band, and one guider"
     assert [title.text for title in browser.find_elements(By.CSS_SELECTOR, ".annotation-text")] == [
         "Hopper, noise 0.1",
         "Hopper, noise 0.3",
@@ -93,7 +99,7 @@ def test_a_click_on_a_name_switches_its_curves_off_and_on(browser):
 
     toggle = browser.find_elements(By.CSS_SELECTOR, ".legendtoggle")[0]
     before = _visible_traces(browser)
-    assert sum(name.startswith("gac") for name in before) == 6
+    assert sum(name.startswith("gac") for name in before) == 2 * 5
     for expected in ([name for name in before if not name.startswith("gac")], before):
         toggle.click()
         _wait(lambda expected=expected: _visible_traces(browser) == expected)

@@ -16,12 +16,12 @@ import torch as th
 import yaml
 
 import benchmarks.run
-from benchmarks.aggregate import compare, finished_runs, summarise_cells
+from benchmarks.aggregate import finished_runs
 from benchmarks.checkpoint import locked
 from benchmarks.config import instantiate, read_algorithm, resolve
 from benchmarks.launch import jobs_left
 from benchmarks.run import environment, run
-from benchmarks.suite import RunSpec, read_preset, read_suite
+from benchmarks.suite import RunSpec, made_with, read_preset, read_suite
 from sb3_gac import GAC
 
 ROOT = Path(__file__).parents[2]
@@ -75,6 +75,9 @@ def test_results_are_aggregated_and_reported(runs, tmp_path):
     result = _program("benchmarks.aggregate", SMOKE, "--runs", runs, "--out", out)
     assert result.returncode == 0, result.stderr
     record = json.loads((tmp_path / "smoke.json").read_text())
+    assert record["reference"] == "sac-asym"
+    assert len(record["made_with"]) == 1
+    assert record["mixed_runs"] == []
     assert record["command"] == "python -m benchmarks.launch benchmarks/suites/smoke.yml"
     assert [(cell["algorithm"], cell["seeds"]) for cell in record["cells"]] == [("gac", [0, 1]), ("sac-asym", [0, 1])]
     assert "guider_mean" in record["cells"][0]
@@ -105,51 +108,6 @@ def test_a_missing_run_is_an_error_or_leaves_its_whole_cell_out(runs, tmp_path):
     assert len(record["still_to_run"]) == 8
     assert "small-600/InvertedDoublePendulum-noise0.2/gac/seed2" in record["still_to_run"]
     assert [cell["seeds"] for cell in record["cells"]] == [[0, 1], [0, 1]]
-
-
-def _evaluations(algorithm, seed, learner, task="T", guider=None):
-    rows = pd.DataFrame({"timesteps": [5_000, 10_000], "learner": learner, "task": task, "noise": 0.1, "algorithm": algorithm})
-    if guider is not None:
-        rows = rows.assign(guider=guider, kl=[0.5, 0.008 + 0.003 * seed], target_kl=0.01)
-    return rows.assign(seed=seed)
-
-
-def test_summary_by_hand():
-    tidy = pd.concat(
-        [
-            _evaluations("gac", 1, [0, 30], guider=[1, 31]),
-            _evaluations("gac", 0, [4, 10], guider=[5, 11]),
-            _evaluations("sac-asym", 0, [0, 2]),
-            _evaluations("sac-asym", 1, [0, 2]),
-        ]
-    )
-    ours, theirs = summarise_cells(tidy, reference="sac-asym")
-    assert (ours["seeds"], ours["final"], ours["final_mean"]) == ([0, 1], [10, 30], 20)
-    assert ours["final_iqm"] == [20, 10, 30]
-    assert ours["area_iqm"][0] == 11
-    assert (ours["steps_to_reference"], theirs["steps_to_reference"]) == (5_000, 10_000)
-    assert ours["guider_mean"] == 21
-    assert (ours["kl_over_target_min"], ours["kl_over_target_max"]) == (0.8, 1.1)
-    assert theirs["final_iqm"] == [2, 2, 2]
-
-
-def test_comparison_by_hand():
-    """One algorithm is twice as good in the first task and worse in one of two runs of the second."""
-    runs_of = {("gac", "T"): [20, 20], ("sac", "T"): [10, 10], ("gac", "U"): [30, 50], ("sac", "U"): [40, 40]}
-    tidy = pd.concat(
-        [
-            _evaluations(algorithm, seed, [0, final], task)
-            for (algorithm, task), finals in runs_of.items()
-            for seed, final in enumerate(finals)
-        ]
-    )
-    results = compare(tidy)
-    # Normalised by 20 and 40: gac 1, 1, 0.75, 1.25; sac 0.5, 0.5, 1, 1; the middle half of each
-    assert results["normalised_iqm"]["gac"][0] == 1.0
-    assert results["normalised_iqm"]["sac"][0] == 0.75
-    assert results["probability_of_improvement"]["gac over sac"][0] == pytest.approx((1 + 0.5) / 2)
-    point, low, high = results["probability_of_improvement"]["sac over gac"]
-    assert low <= point <= high
 
 
 def test_a_failing_run_is_named_with_its_log(tmp_path):
@@ -313,17 +271,29 @@ def test_a_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
             return True
 
     monkeypatch.setattr(benchmarks.run, "CheckpointCallback", Killed)
+    monkeypatch.setattr(benchmarks.run, "provenance", lambda: {"commit": "old", "versions": {"torch": "2"}})
     with pytest.raises(KeyboardInterrupt):
         run(spec, tmp_path)
     monkeypatch.setattr(benchmarks.run, "CheckpointCallback", original)
+    monkeypatch.setattr(benchmarks.run, "provenance", lambda: {"commit": "new", "versions": {"torch": "2"}})
     directory = spec.directory(tmp_path)
     before = json.loads((directory / "checkpoint" / "history.json").read_text())
     assert [row["timesteps"] for row in before] == [200, 400]
+    stopped = json.loads((directory / "timing.json").read_text())
+    assert stopped["steps"] == 400
     run(spec, tmp_path)
     evaluations = pd.read_csv(directory / "evaluations.csv")
     assert evaluations.learner[:2].tolist() == [row["learner"] for row in before], "taken over, not made again"
-    assert json.loads((directory / "timing.json").read_text())["steps"] == 200
+    finished = json.loads((directory / "timing.json").read_text())
+    assert finished["steps"] == 600
+    assert finished["seconds"] > stopped["seconds"]
+    origins = made_with(yaml.safe_load((directory / "config.yaml").read_text()))
+    assert [origin["commit"] for origin in origins] == ["old", "new"]
     assert GAC.load(directory / "model").num_timesteps == 600
+    (directory / "evaluations.csv").unlink()
+    run(spec, tmp_path)
+    origins = made_with(yaml.safe_load((directory / "config.yaml").read_text()))
+    assert [origin["commit"] for origin in origins] == ["new"], "from the start again, nothing of the old one is left"
 
 
 def test_two_runs_are_never_mixed(tmp_path):

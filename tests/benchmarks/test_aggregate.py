@@ -1,0 +1,101 @@
+"""Scores of finished runs, by hand."""
+
+import pandas as pd
+import pytest
+
+from benchmarks.aggregate import choose_reference, compare, summarise_cells
+
+
+def _evaluations(algorithm, seed, learner, task="T", guider=None):
+    rows = pd.DataFrame({"timesteps": [5_000, 10_000], "learner": learner, "task": task, "noise": 0.1, "algorithm": algorithm})
+    if guider is not None:
+        rows = rows.assign(guider=guider, kl=[0.5, 0.008 + 0.003 * seed], target_kl=0.01)
+    return rows.assign(seed=seed)
+
+
+def test_summary_by_hand():
+    tidy = pd.concat(
+        [
+            _evaluations("gac", 1, [0, 30], guider=[1, 31]),
+            _evaluations("gac", 0, [4, 10], guider=[5, 11]),
+            _evaluations("sac-asym", 0, [0, 2]),
+            _evaluations("sac-asym", 1, [0, 2]),
+        ]
+    )
+    ours, theirs = summarise_cells(tidy, reference="sac-asym")
+    assert (ours["seeds"], ours["final"], ours["final_mean"]) == ([0, 1], [10, 30], 20)
+    assert ours["final_iqm"] == [20, 10, 30]
+    assert ours["area_iqm"][0] == 11
+    assert (ours["steps_to_reference"], theirs["steps_to_reference"]) == (5_000, 10_000)
+    assert ours["guider_mean"] == 21
+    assert (ours["kl_over_target_min"], ours["kl_over_target_max"]) == (0.8, 1.1)
+    assert theirs["final_iqm"] == [2, 2, 2]
+
+
+def _finals(finals_of, start=0.0):
+    """
+    :param finals_of: (algorithm, task) -> final return by seed, in order or as a dict
+    :param start: return at the first evaluation of all
+    """
+    return pd.concat(
+        [
+            _evaluations(algorithm, seed, [start, final], task)
+            for (algorithm, task), finals in finals_of.items()
+            for seed, final in (finals if isinstance(finals, dict) else dict(enumerate(finals))).items()
+        ]
+    )
+
+
+def test_comparison_by_hand():
+    """One algorithm is twice as good in the first task and worse in one of two runs of the second."""
+    finals = {("gac", "T"): [20, 20], ("sac", "T"): [10, 10], ("gac", "U"): [30, 50], ("sac", "U"): [40, 40]}
+    results = compare(_finals(finals))
+    # Between 0 and 20, 0 and 40: gac 1, 1, 0.75, 1.25; sac 0.5, 0.5, 1, 1; the middle half of each
+    assert results["normalised_iqm"]["gac"][0] == 1.0
+    assert results["normalised_iqm"]["sac"][0] == 0.75
+    assert results["probability_of_improvement"]["gac over sac"][0] == pytest.approx((1 + 0.5) / 2)
+    point, low, high = results["probability_of_improvement"]["sac over gac"]
+    assert low <= point <= high
+
+
+@pytest.mark.parametrize("shift", [-1000.0, -30.0, -20.0, 7.0])
+def test_the_comparison_does_not_depend_on_where_returns_are_zero(shift):
+    finals = {("gac", "T"): [20, 20], ("sac", "T"): [10, 15], ("gac", "U"): [30, 50], ("sac", "U"): [40, 44]}
+    shifted = {key: [final + shift for final in values] for key, values in finals.items()}
+    plain, moved = compare(_finals(finals)), compare(_finals(shifted, start=shift))
+    assert moved["normalised_iqm"] == plain["normalised_iqm"]
+    assert moved["normalised_iqm"]["gac"][0] > moved["normalised_iqm"]["sac"][0], "less negative is better"
+    assert moved["compared"]["cells"][0]["low"] == shift
+
+
+def test_where_nobody_differs_all_are_the_best():
+    results = compare(_finals({("gac", "T"): [0, 0], ("sac", "T"): [0, 0]}))
+    assert results["normalised_iqm"] == {"gac": [1, 1, 1], "sac": [1, 1, 1]}
+
+
+def test_cells_with_other_numbers_of_seeds_are_compared_on_equally_many():
+    finals = {
+        ("gac", "T"): [20, 20, 90],
+        ("sac", "T"): [10, 10, 90],
+        ("gac", "U"): {5: 30, 6: 50},
+        ("sac", "U"): {5: 40, 6: 40},
+        ("sb3", "T"): [1, 1],
+    }
+    compared = compare(_finals(finals))["compared"]
+    assert (compared["algorithms"], compared["left_out"]) == (["gac", "sac"], ["sb3"])
+    assert [cell["seeds"]["gac"] for cell in compared["cells"]] == [[0, 1], [5, 6]]
+    assert [cell["seeds"]["sac"] for cell in compared["cells"]] == [[0, 1], [5, 6]]
+
+
+def test_nothing_in_common_is_no_comparison():
+    results = compare(_finals({("gac", "T"): [1, 2], ("sac", "U"): [1, 2]}))
+    assert results["compared"] == {"algorithms": [], "left_out": ["gac", "sac"], "cells": []}
+    assert results["normalised_iqm"] == results["probability_of_improvement"] == {}
+
+
+def test_the_reference_is_one_that_is_there():
+    assert choose_reference(["gac", "sac-asym"]) == "sac-asym"
+    assert choose_reference(["gac", "gac-independent"]) == "gac"
+    assert choose_reference(["gac", "sac-asym"], "gac") == "gac"
+    with pytest.raises(ValueError, match=r"reference must be one of \['gac'\], got 'sac'"):
+        choose_reference(["gac"], "sac")
