@@ -132,8 +132,8 @@ class NetworkTraining(FaultTolerance):
         waits = isinstance(buffer, EpisodeReplayBuffer) and not buffer.full and buffer.n_episodes == 0
         if waits and not self._waiting:
             warnings.warn(
-                f"There are no gradient steps until the first episode has ended, although learning_starts={self.learning_starts}"
-                " environment steps are over: a recurrent policy learns from whole episodes.",
+                "There are no gradient steps until the first episode has ended, although "
+                f"learning_starts={self.learning_starts} is over: a recurrent policy learns from whole episodes.",
                 stacklevel=3,
             )
         self._waiting = waits
