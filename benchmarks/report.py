@@ -133,7 +133,12 @@ def algorithm_lines(group: pd.DataFrame, algorithm: str, color: str, in_legend: 
         style = {"mode": "lines", "line": {"color": color}, **style}
         return graph_objects.Scatter(x=x, y=y, name=name, legendgroup=algorithm, showlegend=showlegend, **style)
 
-    thin: dict[str, Any] = {"mode": "lines+markers", "marker": {"size": 3}, "line": {"color": color, "width": 0.7}, "opacity": 0.5}
+    thin: dict[str, Any] = {
+        "mode": "lines+markers",
+        "marker": {"size": 3},
+        "line": {"color": color, "width": 0.7},
+        "opacity": 0.5,
+    }
     lines = [line(run.timesteps, run.learner, f"{algorithm}, seed {seed}", **thin) for seed, run in group.groupby("seed")]
     learner = curves(group)
     there, back = list(learner.index), list(learner.index[::-1])
