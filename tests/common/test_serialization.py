@@ -60,7 +60,7 @@ class Mine:
     pass
 
 
-@pytest.mark.parametrize("value", [Mine, Mine(), lambda x: x, {1: 2}, np.array([None])], ids=repr)
+@pytest.mark.parametrize("value", [Mine, Mine(), lambda x: x, {1: 2}, np.array([None])], ids=["class", "object", "function", "keys", "array"])
 def test_what_is_of_other_libraries_is_named(value):
     with pytest.raises((UntrustedNameError, TypeError)):
         encode(value, {})
