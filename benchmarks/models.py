@@ -136,14 +136,14 @@ class LoopedGRU(th.nn.GRU):
         return th.cat(outputs), state
 
 
-def make_recurrent_step(looped: bool, sizes: tuple[int, int, int], length: int, batch: int, width: int) -> Callable[[], None]:
+def make_recurrent_step(what: str, sizes: tuple[int, int, int], length: int, batch: int, width: int) -> Callable[[], Any]:
     """
-    :param looped: whether a Python loop goes over time
+    :param what: "ours"; "looped", with a Python loop over time; "sampling", which is a part of either
     :param sizes: partial, privileged, number of actions
     :param length: of the episodes, T
     :param batch: episodes, B
     :param width: of all layers
-    :return: one gradient step of GAC with GRUs
+    :return: one gradient step of GAC with GRUs, or that part
     """
     model = sb3_gac.GAC(
         "MultiInputGruPolicy",
@@ -157,7 +157,10 @@ def make_recurrent_step(looped: bool, sizes: tuple[int, int, int], length: int, 
     )
     model.set_logger(Logger(None, []))
     model.learn(40 * length)
-    if looped:
+    if what == "sampling":
+        buffer: Any = model.replay_buffer
+        return lambda: buffer.sample(batch)
+    if what == "looped":
         for module in model.policy.modules():
             if isinstance(module, th.nn.GRU):
                 module.__class__ = LoopedGRU

@@ -1,6 +1,7 @@
 """Where the time goes: of a gradient step, and of training as a whole."""
 
 import cProfile
+import itertools
 import pstats
 import time
 from collections.abc import Callable
@@ -15,9 +16,9 @@ import sb3_gac
 from benchmarks.contenders import timer
 from benchmarks.models import make_model, matmul_rate, step_flops
 
-PARTS = {  # of a compiled gradient step -> file and function
-    "compiled losses and gradients": ("compilation.py", "__call__"),
-    "optimisers": ("adam.py", "step"),
+COMPILED = ("compilation.py", "__call__")
+PARTS = {  # of a compiled gradient step -> file and function, none of which calls another
+    "optimisers": ("training.py", "_step"),  # the networks'; the dual variables have theirs among their own
     "dual variables": ("dual.py", "update"),
     "targets": ("policies.py", "update_targets"),
     "sampling": ("buffers.py", "sample"),
@@ -28,8 +29,8 @@ def profile_step(contender: str, sizes: tuple[int, int, int], batch: int, width:
     """
     Where the time of a gradient step goes, on one thread.
 
-    :return: parts with their milliseconds and shares; the first, within the second, is what the matrix products would take
-        at the rate of a plain one
+    :return: parts with their milliseconds and shares, which add up; of compiled code, what its matrix products would take at
+        the rate of a plain one, and the rest
     """
     th.set_num_threads(1)
     model = make_model(contender, sizes, batch, width)
@@ -40,10 +41,13 @@ def profile_step(contender: str, sizes: tuple[int, int, int], batch: int, width:
     profiler.disable()
     stats = pstats.Stats(profiler)
     total = stats.total_tt  # type: ignore[attr-defined]
-    inside = {part: cumulative_seconds(stats, *where) for part, where in PARTS.items()}
-    inside["optimisers"] -= cumulative_seconds(stats, "adam.py", "step", caller=("dual.py", "update"))
     products = steps * step_flops(sizes, batch, width) / matmul_rate(batch, width)
-    rows = {"matrix products, at a plain one's rate": products, **inside, "all else": total - sum(inside.values())}
+    rows = {
+        "matrix products, at a plain one's rate": products,
+        "the rest inside compiled code": cumulative_seconds(stats, *COMPILED) - products,
+        **{part: cumulative_seconds(stats, *where) for part, where in PARTS.items()},
+    }
+    rows["all else"] = total - sum(rows.values())
     return [
         {
             "contender": contender,
@@ -55,33 +59,33 @@ def profile_step(contender: str, sizes: tuple[int, int, int], batch: int, width:
     ]
 
 
-def cumulative_seconds(stats: pstats.Stats, file: str, function: str, caller: tuple[str, str] | None = None) -> float:
+def cumulative_seconds(stats: pstats.Stats, file: str, function: str) -> float:
     """
     :param stats: of a profile
     :param file: end of a file's name
     :param function: in that file
-    :param caller: file and function, if only calls from there count
     :return: in the function and all that it calls
     """
-    total = 0.0
-    for (name, _, called), (_, _, _, cumulative, callers) in stats.stats.items():  # type: ignore[attr-defined]
-        if called == function and name.endswith(file):
-            from_there = [
-                times[3] for (at, _, by), times in callers.items() if caller and at.endswith(caller[0]) and by == caller[1]
-            ]
-            total += sum(from_there) if caller else cumulative
-    return total
+    return sum(
+        cumulative
+        for (name, _, called), (_, _, _, cumulative, _) in stats.stats.items()  # type: ignore[attr-defined]
+        if called == function and name.endswith(file)
+    )
 
 
-def env_step(env: gym.Env) -> Callable[[], None]:
+def env_step(env: gym.Env, n_actions: int = 100) -> Callable[[], None]:
     """
-    :param env: to step with one action over and over, reset where an episode ends
+    Contenders with the same spaces get the same actions, and so the same physics to compute.
+
+    :param env: to step, reset where an episode ends
+    :param n_actions: random actions that are taken over and over
     """
-    action = env.action_space.sample()
+    env.action_space.seed(0)
+    actions = itertools.cycle([env.action_space.sample() for _ in range(n_actions)])
     env.reset(seed=0)
 
     def step() -> None:
-        if any(env.step(action)[2:4]):
+        if any(env.step(next(actions))[2:4]):
             env.reset()
 
     return step

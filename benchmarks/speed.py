@@ -11,6 +11,7 @@ only spaces and sizes of the tasks, with random data; the rollout is that of Hal
 import argparse
 import json
 import tempfile
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -75,9 +76,9 @@ def median_ratio(numerators: list[float], denominators: list[float]) -> float:
 def compare_recurrent(batch: int, width: int, threads: int, rounds: int) -> dict[str, float]:
     """
     :return: gradient steps per second of GAC with GRUs on RepeatPreviousEasy's sizes, as a multiple of a Python loop over
-        time, and their share of the limit
+        time, and their share of the limit; sampling's share of their time
     """
-    arguments = {name: (name == "looped", (8, 5, 4), 51, batch, width) for name in ("ours", "looped")}
+    arguments = {name: (name, (8, 5, 4), 51, batch, width) for name in ("ours", "looped", "sampling")}
     with process_timers(make_recurrent_step, arguments, threads) as timers:
         seconds = alternate(timers, repetitions=2, rounds=rounds)
     th.set_num_threads(threads)
@@ -86,6 +87,7 @@ def compare_recurrent(batch: int, width: int, threads: int, rounds: int) -> dict
         "ours_per_second": round(1 / float(np.median(seconds["ours"])), 2),
         "ours_over_looped": round(median_ratio(seconds["looped"], seconds["ours"]), 2),
         "share_of_limit": round(1 / float(np.median(seconds["ours"])) / limit, 3),
+        "sampling_share": round(median_ratio(seconds["sampling"], seconds["ours"]), 3),
     }
 
 
@@ -129,23 +131,28 @@ def compare_wrappers(rounds: int = ROUNDS) -> dict[str, float]:
 
 def compare_deployment(sizes: tuple[int, int, int], width: int, rounds: int) -> dict[str, float]:
     """
-    :return: microseconds of one action from one observation: SB3 SAC's ``predict``, GAC's, and the exported learner's
+    :return: processor time, with one thread: microseconds of one action from one observation by SB3 SAC's ``predict``, by
+        GAC's, and by the exported learner; milliseconds until its file is loaded
     """
     th.set_num_threads(1)
     gac, sac = (make_model(name, sizes, 256, width) for name in ("gac", "sac"))
     observation = {key: box.sample() for key, box in SpacesOnly(*sizes).observation_space.items()}  # type: ignore[attr-defined]
     with tempfile.TemporaryDirectory() as directory:
-        learner = sb3_gac.Learner.load(sb3_gac.export_learner(gac, Path(directory) / "learner.onnx"))
+        path = sb3_gac.export_learner(gac, Path(directory) / "learner.onnx")
+        learner = sb3_gac.Learner.load(path)
+        load = timer(lambda: sb3_gac.Learner.load(path), time.process_time)
+        loads = alternate({"load": load}, repetitions=10, rounds=rounds)["load"]
     partial = observation["partial"]
     timers = {
-        "sac_predict": timer(lambda: sac.predict(observation, deterministic=True)),
-        "gac_predict": timer(lambda: gac.predict({"partial": partial}, deterministic=True)),
-        "exported": timer(lambda: learner.act(partial)),
+        "sac_predict": timer(lambda: sac.predict(observation, deterministic=True), time.process_time),
+        "gac_predict": timer(lambda: gac.predict({"partial": partial}, deterministic=True), time.process_time),
+        "exported": timer(lambda: learner.act(partial), time.process_time),
     }
     seconds = alternate(timers, repetitions=200, rounds=rounds)
     return {
         **{f"{name}_microseconds": round(1e6 * float(np.median(values)), 1) for name, values in seconds.items()},
         "exported_times_faster_than_sac": round(median_ratio(seconds["sac_predict"], seconds["exported"]), 1),
+        "load_milliseconds": round(1e3 * float(np.median(loads)), 2),
     }
 
 

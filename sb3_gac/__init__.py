@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
     from sb3_gac.common.buffers import CompactDictReplayBuffer
     from sb3_gac.common.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
+    from sb3_gac.common.checkpoint_callback import ExactCheckpointCallback
+    from sb3_gac.common.checkpoint_files import CheckpointError
+    from sb3_gac.common.divergence import DivergenceError
+    from sb3_gac.common.env_guard import EnvironmentFailedError, InvalidStepError
     from sb3_gac.common.episodes import EpisodeReplayBuffer
     from sb3_gac.common.normalization import DeploymentNormalizer
     from sb3_gac.export import export_learner
@@ -30,13 +34,18 @@ _WHERE = {
     "GAC": "gac.gac",
     "PRESETS": "gac.presets",
     "AsymmetricSAC": "baselines.asymmetric_sac",
+    "CheckpointError": "common.checkpoint_files",
     "CompactDictReplayBuffer": "common.buffers",
     "DeploymentNormalizer": "common.normalization",
+    "DivergenceError": "common.divergence",
+    "EnvironmentFailedError": "common.env_guard",
     "EpisodeReplayBuffer": "common.episodes",
+    "ExactCheckpointCallback": "common.checkpoint_callback",
     "GACPolicy": "gac.policies",
     "GACShare": "gac.ablations",
     "GACWithoutQ": "gac.ablations",
     "GuiderLearnerEvalCallback": "common.callbacks",
+    "InvalidStepError": "common.env_guard",
     "Learner": "learner",
     "SeededEvalCallback": "common.callbacks",
     "export_learner": "export",
@@ -58,13 +67,18 @@ __all__ = [
     "GAC",
     "PRESETS",
     "AsymmetricSAC",
+    "CheckpointError",
     "CompactDictReplayBuffer",
     "DeploymentNormalizer",
+    "DivergenceError",
+    "EnvironmentFailedError",
     "EpisodeReplayBuffer",
+    "ExactCheckpointCallback",
     "GACPolicy",
     "GACShare",
     "GACWithoutQ",
     "GuiderLearnerEvalCallback",
+    "InvalidStepError",
     "Learner",
     "SeededEvalCallback",
     "__version__",

@@ -5,6 +5,7 @@ Nothing but the deployed policy goes into the file: no guider, no critics, and n
 """
 
 import json
+import tempfile
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,23 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy
+from sb3_gac.common.checks import check_positive
 from sb3_gac.common.memory import Memory
 from sb3_gac.common.normalization import DeploymentNormalizer
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.verification import check_agreement, draw_observations
 from sb3_gac.version import __version__
 
 ACTION, STATE, NEXT_STATE = "action", "state", "next_state"
 METADATA_KEY = "sb3_gac"
+ACTION_MEANINGS = {  # whether actions are continuous -> what they are
+    True: "the deterministic action, between low and high, for the environment's step()",
+    False: "number of the most probable action, from 0 to n - 1, for the environment's step()",
+}
 
 
 class DeployedModule(nn.Module):
@@ -41,15 +49,20 @@ class DeployedModule(nn.Module):
         self.policy = policy
         self.keys = list(policy.observation_space.spaces)
         self.normalised = [key for key in self.keys if normalizer is not None and key in normalizer.mean]
-        for key in self.normalised:
+        for index, key in enumerate(self.normalised):  # buffers' names can't hold all that keys can
             assert normalizer is not None
-            self.register_buffer(f"mean_{key}", th.as_tensor(normalizer.mean[key], dtype=th.float64))
+            self.register_buffer(f"mean_{index}", th.as_tensor(normalizer.mean[key], dtype=th.float64))
             std = np.sqrt(normalizer.var[key] + normalizer.epsilon)
-            self.register_buffer(f"std_{key}", th.as_tensor(std, dtype=th.float64))
+            self.register_buffer(f"std_{index}", th.as_tensor(std, dtype=th.float64))
+        self.action_name, self.state_name, self.next_state_name = (self._free(name) for name in (ACTION, STATE, NEXT_STATE))
         self.clip_obs = 0.0 if normalizer is None else float(normalizer.clip_obs)
         if isinstance(policy.action_space, spaces.Box):
             self.register_buffer("low", th.as_tensor(policy.action_space.low, dtype=th.float32))
             self.register_buffer("high", th.as_tensor(policy.action_space.high, dtype=th.float32))
+
+    def _free(self, name: str) -> str:
+        """The name, told apart from an entry that is called the same."""
+        return self._free(f"{name}_") if name in self.keys else name
 
     @property
     def memory(self) -> Memory | None:
@@ -74,7 +87,8 @@ class DeployedModule(nn.Module):
     def _normalize(self, key: str, value: th.Tensor) -> th.Tensor:
         if key not in self.normalised:
             return value
-        standardised = (value.double() - getattr(self, f"mean_{key}")) / getattr(self, f"std_{key}")
+        index = self.normalised.index(key)
+        standardised = (value.double() - getattr(self, f"mean_{index}")) / getattr(self, f"std_{index}")
         return standardised.clamp(-self.clip_obs, self.clip_obs).float()
 
     def _in_range(self, action: th.Tensor) -> th.Tensor:
@@ -89,27 +103,48 @@ def export_learner(
     path: str | Path,
     normalizer: DeploymentNormalizer | None = None,
     units: dict[str, str] | None = None,
+    verify_on: int = 256,
 ) -> Path:
     """
-    Write a model's deployed policy to a file: see :class:`sb3_gac.learner.Learner` for its use.
+    Write a model's deployed policy to a file, once its actions there are the model's: see :class:`sb3_gac.learner.Learner`
+    for its use.
 
     :param model: trained
     :param path: with the suffix ".onnx", or ".pt" for TorchScript
     :param normalizer: of the observations; by default that of the model's ``VecNormalize``, if it has one
     :param units: entry, or "action" -> unit, kept in the file's metadata
+    :param verify_on: number of observations to compare the file's actions and those of ``predict`` on, see
+        :func:`sb3_gac.verification.check_agreement`
     :return: the path
-    :raises ValueError: if the suffix is another
+    :raises ValueError: if the suffix is another, there is nothing to verify on, a unit is that of something else, or the
+        model learned under a ``VecNormalize`` that it does not have any more
+    :raises sb3_gac.verification.ExportError: if the file's actions are not those of ``predict``; nothing is then written
     """
     path = Path(path)
-    if normalizer is None and (vec_normalize := model.get_vec_normalize_env()) is not None:
-        keys = model.policy.role_keys[model.policy.roles.deployed]
-        normalizer = DeploymentNormalizer.from_vec_normalize(vec_normalize, keys)
     if path.suffix not in WRITERS:
         raise ValueError(f'path must end in ".onnx" or, for TorchScript, ".pt", got {str(path)!r}.')
+    check_positive("verify_on", verify_on)
+    normalizer = _normalizer_of(model) if normalizer is None else normalizer
     module = DeployedModule(deepcopy(model.policy.deployed), normalizer).cpu().eval().requires_grad_(False)
-    with th.no_grad():
-        WRITERS[path.suffix](module, path, json.dumps(describe(module, type(model).__name__, units or {})))
+    metadata = json.dumps(describe(module, type(model).__name__, units or {}), allow_nan=False)
+    with th.no_grad(), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as directory:
+        written = Path(directory) / path.name
+        WRITERS[path.suffix](module, written, metadata)
+        check_agreement(module.policy, written, normalizer, verify_on)
+        written.replace(path)
     return path
+
+
+def _normalizer_of(model: AsymmetricOffPolicyAlgorithm) -> DeploymentNormalizer | None:
+    vec_normalize = model.get_vec_normalize_env()
+    if vec_normalize is not None:
+        return DeploymentNormalizer.from_vec_normalize(vec_normalize, model.policy.role_keys[model.policy.roles.deployed])
+    if model.trained_normalised:
+        raise ValueError(
+            "The model learned from observations that VecNormalize normalised, but was loaded without it: load it with "
+            'env=VecNormalize.load("<its statistics>", venv), or pass normalizer=DeploymentNormalizer.from_vec_normalize(...).'
+        )
+    return None
 
 
 def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> dict[str, Any]:
@@ -117,41 +152,61 @@ def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> d
     :param module: to export
     :param algorithm: name of its class
     :param units: entry, or "action" -> unit
-    :return: what its file says of itself: entries and actions with shapes, types, bounds and units, size of its memory
+    :return: what its file says of itself, as JSON holds it: entries and actions with shapes, types, bounds (``None`` where
+        there is none) and units, and the memory to be carried from one action to the next (``None`` without one)
+    :raises ValueError: if a unit is that of something else
     """
+    unknown = sorted(set(units) - {*module.keys, module.action_name})
+    if unknown:
+        raise ValueError(f"units names {unknown}, but the policy reads {module.keys} and gives {module.action_name!r}.")
 
     def of(name: str, space: spaces.Space) -> dict[str, Any]:
-        box = {}
+        box: dict[str, Any] = {}
         if isinstance(space, spaces.Box):
-            box = {"low": np.ravel(space.low).tolist(), "high": np.ravel(space.high).tolist()}
+            box = {"low": _finite(space.low), "high": _finite(space.high)}
         elif isinstance(space, spaces.Discrete):
             box = {"n": int(space.n)}
+        if is_image_space(space):
+            box |= {"layout": "channels first" if is_image_space_channels_first(space) else "channels last"}  # type: ignore
         return {"name": name, "shape": list(space.shape or ()), "dtype": str(space.dtype), "unit": units.get(name), **box}
 
     assert isinstance(module.policy.observation_space, spaces.Dict)
+    memory = None
+    if module.memory is not None:
+        memory = {
+            "input": module.state_name,
+            "output": module.next_state_name,
+            "size": module.memory.state_size,
+            "initial": 0.0,
+        }
+    action_space = module.policy.action_space
     return {
         "version": __version__,
         "algorithm": algorithm,
         "entries": [of(key, space) for key, space in module.policy.observation_space.items()],
-        "action": of(ACTION, module.policy.action_space),
-        "state_size": 0 if module.memory is None else module.memory.state_size,
+        "action": of(module.action_name, action_space) | {"meaning": ACTION_MEANINGS[isinstance(action_space, spaces.Box)]},
+        "memory": memory,
         "normalised": module.normalised,
     }
 
 
+def _finite(bounds: np.ndarray) -> list[float | None]:
+    return [bound if np.isfinite(bound) else None for bound in np.ravel(bounds).tolist()]
+
+
 def _example(module: DeployedModule) -> tuple[th.Tensor, ...]:
     """Two observations, of no importance."""
-    assert isinstance(module.policy.observation_space, spaces.Dict)
-    entries = [np.stack([space.sample()] * 2) for space in module.policy.observation_space.values()]
+    entries = draw_observations(module.policy, None, 2).values()
     state = [] if module.memory is None else [np.zeros((2, module.memory.state_size), dtype=np.float32)]
-    return tuple(th.as_tensor(np.nan_to_num(value)) for value in (*entries, *state))
+    return tuple(th.as_tensor(value) for value in (*entries, *state))
 
 
 def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
     import onnx
 
     remembers = module.memory is not None
-    inputs, outputs = [*module.keys, *[STATE] * remembers], [ACTION, *[NEXT_STATE] * remembers]
+    inputs = [*module.keys, *[module.state_name] * remembers]
+    outputs = [module.action_name, *[module.next_state_name] * remembers]
     batch = {name: {0: "batch"} for name in (*inputs, *outputs)}
     names: dict[str, Any] = {"input_names": inputs, "output_names": outputs, "dynamic_axes": batch}
     th.onnx.export(module, _example(module), str(path), **names, dynamo=False)

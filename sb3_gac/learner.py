@@ -28,7 +28,9 @@ class Learner:
     def __init__(self, session: onnxruntime.InferenceSession):
         self._session = session
         self.metadata: dict[str, Any] = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
-        self._entries = {entry["name"]: entry for entry in self.metadata["entries"]}
+        entries = self.metadata["entries"]
+        self._entries = {entry["name"]: (np.dtype(entry["dtype"]), tuple(entry["shape"])) for entry in entries}
+        self._memory: dict[str, Any] | None = self.metadata["memory"]
         self._state: np.ndarray | None = None
 
     @classmethod
@@ -55,39 +57,58 @@ class Learner:
         """
         :param observation: of the policy's entries, single or batched, as the sensors give it; where there is one, that alone
         :return: action in the environment's range
-        :raises ValueError: if an entry is missing, not one of the policy's, of another shape, or not finite
+        :raises ValueError: if an entry is missing, not one of the policy's, of another shape or type, or not finite; if the
+            number of observations changes within an episode
         """
-        entries = self._checked(observation)
-        name, first = next(iter(entries.items()))
-        batched = first.ndim > len(self._entries[name]["shape"])
-        inputs = {key: value if batched else value[None] for key, value in entries.items()}
-        size = self.metadata["state_size"]
-        if size:
-            n_rows = first.shape[0] if batched else 1
-            if self._state is None or len(self._state) != n_rows:
-                self._state = np.zeros((n_rows, size), dtype=np.float32)
-            inputs["state"] = self._state
-        action, *state = self._session.run(None, inputs)
-        if size:
-            self._state = state[0]
-        return action if batched else action[0]
+        inputs, n_rows = self._checked(observation)
+        if n_rows is None:
+            inputs = {name: value[None] for name, value in inputs.items()}
+        if self._memory is None:
+            (action,) = self._session.run(None, inputs)
+        else:
+            inputs[self._memory["input"]] = self._remembered(1 if n_rows is None else n_rows)
+            action, self._state = self._session.run(None, inputs)
+        return action[0] if n_rows is None else action
 
-    def _checked(self, observation: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def _remembered(self, n_rows: int) -> np.ndarray:
+        assert self._memory is not None
+        if self._state is None:
+            return np.full((n_rows, self._memory["size"]), self._memory["initial"], dtype=np.float32)
+        if len(self._state) != n_rows:
+            raise ValueError(
+                f"The policy remembers {len(self._state)} observations, but got {n_rows}: call reset() when an episode starts."
+            )
+        return self._state
+
+    def _checked(self, observation: np.ndarray | Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int | None]:
+        """The policy's entries, and how many of each there are; ``None`` if they are not batched."""
         if not isinstance(observation, Mapping):
             if len(self._entries) > 1:
                 raise ValueError(f"The policy reads {list(self._entries)}: pass a dict with these entries, not an array.")
             observation = {next(iter(self._entries)): observation}
-        if set(observation) != set(self._entries):
+        if observation.keys() != self._entries.keys():
+            missing = [key for key in self._entries if key not in observation]
+            unread = [key for key in observation if key not in self._entries]
             raise ValueError(
-                f"The policy reads the entries {list(self._entries)}, but the observation has {list(observation)}: "
-                "nothing else belongs on the robot."
+                f"The policy reads the entries {list(self._entries)}; missing: {missing}, not read: {unread}. "
+                "Nothing else belongs on the robot."
             )
-        return {name: self._checked_entry(name, observation[name]) for name in self._entries}
+        entries = {name: self._checked_entry(name, observation[name]) for name in self._entries}
+        n_rows = {name: len(array) if array.ndim > len(self._entries[name][1]) else None for name, array in entries.items()}
+        first, *others = n_rows.values()
+        if any(other != first for other in others):
+            raise ValueError(f"The entries must be single, or batched alike, but their rows are {n_rows}.")
+        return entries, first
 
     def _checked_entry(self, name: str, value: Any) -> np.ndarray:
-        entry = self._entries[name]
-        array, shape = np.asarray(value, dtype=entry["dtype"]), tuple(entry["shape"])
-        if array.shape[array.ndim - len(shape) :] != shape or array.ndim - len(shape) not in (0, 1):
+        dtype, shape = self._entries[name]
+        array = np.asarray(value)
+        if array.dtype != dtype:
+            if not np.can_cast(array.dtype, dtype, "same_kind"):
+                raise ValueError(f'The entry "{name}" must be of type {dtype}, but is {array.dtype}: values would be lost.')
+            array = array.astype(dtype)
+        n_leading = array.ndim - len(shape)
+        if array.shape[n_leading:] != shape or n_leading not in (0, 1):
             raise ValueError(f'The entry "{name}" must have the shape {shape}, or (B, ...) of it, but has {array.shape}.')
         if not np.isfinite(array).all():
             raise ValueError(f'The entry "{name}" holds NaN or infinite values: no action can follow from it.')

@@ -37,6 +37,12 @@ class TwoViewBandit(gym.Env):
         self._step += 1
         return self._draw(), reward, self._step >= self.length, False, {}
 
+    def checkpoint_state(self) -> dict[str, Any]:
+        return {"target": self._target, "step": self._step}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        self._target, self._step = state["target"], state["step"]
+
     def _draw(self) -> dict[str, np.ndarray]:
         self._target = self.np_random.uniform(-0.8, 0.8)
         seen = self._target + self.noise_std * self.np_random.standard_normal()
@@ -90,6 +96,12 @@ class Recall(gym.Env):
         last = self._step == self.length
         return self._views(), float(last and action == self._cue), last, False, {}
 
+    def checkpoint_state(self) -> dict[str, Any]:
+        return {"cue": self._cue, "step": self._step}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        self._cue, self._step = state["cue"], state["step"]
+
     def _views(self) -> dict[str, np.ndarray]:
         partial = np.zeros(4, dtype=np.float32)
         if self._step == 0:
@@ -98,9 +110,36 @@ class Recall(gym.Env):
         return {"partial": partial, "privileged": np.eye(3, dtype=np.float32)[self._cue]}
 
 
+class Sampled(gym.Env):
+    """
+    Observations are drawn from their space; the reward is the action's first number, the smaller the better.
+
+    :param observation_space: Dict
+    :param action_space: Box or Discrete, by default a Box of one number
+    :param length: steps per episode
+    """
+
+    def __init__(self, observation_space: spaces.Dict, action_space: spaces.Space | None = None, length: int = 5):
+        self.observation_space = observation_space
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32) if action_space is None else action_space
+        self.length = length
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
+        super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
+        self._step = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict]:
+        self._step += 1
+        return self.observation_space.sample(), -float(np.ravel(action)[0]), self._step >= self.length, False, {}
+
+
 def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
     """A model whose gradient steps take a few milliseconds."""
     defaults = {
+        "policy": "MultiInputPolicy",
         "learning_starts": 10,
         "batch_size": 16,
         "buffer_size": 1000,
@@ -108,7 +147,7 @@ def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
         "device": "cpu",
         "policy_kwargs": {"net_arch": [16]},
     }
-    return cls("MultiInputPolicy", TwoViewBandit() if env is None else env, **{**defaults, **arguments})
+    return cls(**{"policy": "MultiInputPolicy", "env": TwoViewBandit() if env is None else env, **defaults, **arguments})
 
 
 def optimizers_of(policy: Any) -> list[Any]:

@@ -13,7 +13,7 @@ BASELINES = sorted({path.stem for path in (ROOT / "sb3_gac/baselines").glob("[!_
 FORBIDDEN = {
     "sb3_gac/common/losses.py": r"sb3_gac",
     "sb3_gac/common/distributions.py": r"sb3_gac",
-    "sb3_gac/common/dual.py": r"sb3_gac(?!\.common\.(losses|flat)\b)",
+    "sb3_gac/common/dual.py": r"sb3_gac(?!\.common\.(checks|flat|losses)\b)",
     "sb3_gac/common/**/*.py": r"sb3_gac(?!\.(common|envs)\b)",
     "sb3_gac/envs/**/*.py": r"torch\b|stable_baselines3|sb3_gac(?!\.envs\b)",
     **{

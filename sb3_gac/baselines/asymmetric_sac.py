@@ -114,7 +114,8 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         if diagnose:
             metrics["ent_coef"] = self.ent_coef_dual.value
             metrics["entropy"] = -masked_mean(log_prob, batch.mask)
-            metrics |= {f"actor_{name}": value for name, value in actor.diagnostics().items()}
+            diagnostics = actor.diagnostics()
+            metrics |= {f"actor_{name}": masked_mean(values, batch.mask) for name, values in diagnostics.items()}
         return metrics
 
     @compilable

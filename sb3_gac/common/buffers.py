@@ -110,6 +110,33 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         self._finals = FinalObservations(self.layout)
         self.endings[:] = 0
 
+    # --- checkpoints -------------------------------------------------------------------------------------------------
+
+    @property
+    def n_added(self) -> int:
+        """Transitions ever added, per environment."""
+        return self._n_added
+
+    def rows_by_name(self) -> dict[str, np.ndarray]:
+        """What the ring holds, by row: arrays of shape (rows, n_envs, \\*), not copied; a step writes its row and the next."""
+        return {**self._rows, "actions": self.actions, "rewards": self.rewards, "endings": self.endings}
+
+    def bookkeeping(self) -> dict[str, Any]:
+        """All else that there is, for :meth:`restore_bookkeeping`."""
+        return {"n_added": self._n_added, "shape": list(self.rewards.shape), "finals": self._finals.state()}
+
+    def restore_bookkeeping(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`bookkeeping`
+        :raises ValueError: if it is of a buffer of another size
+        """
+        if state["shape"] != list(self.rewards.shape):
+            raise ValueError(f"The buffer has (rows, environments) {list(self.rewards.shape)}, and had {state['shape']}.")
+        self._n_added = state["n_added"]
+        self.pos = self._n_added % self.n_rows
+        self.full = self._n_added >= self.buffer_size
+        self._finals.restore(state["finals"])
+
     # --- adding ------------------------------------------------------------------------------------------------------
 
     def add(  # type: ignore[override]
@@ -131,7 +158,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         """
         rows, next_rows = self.layout.pack(obs, self.n_envs), self.layout.pack(next_obs, self.n_envs)
         if self._n_added:
-            self._keep_what_does_not_continue(rows)
+            self._cut_what_does_not_continue(rows)
         for group, values in rows.items():
             self._rows[group][self.pos] = values
         self.actions[self.pos] = np.reshape(action, (self.n_envs, self.action_dim))
@@ -149,14 +176,23 @@ class CompactDictReplayBuffer(DictReplayBuffer):
             self._rows[group][self.pos] = values
         self._finals.forget_before((self._n_added - self.size()) * self.n_envs)
 
-    def _keep_what_does_not_continue(self, rows: Rows) -> None:
-        """Where an episode goes on from another observation than it reached, someone reset the environment."""
-        newest = {group: values[self.pos] for group, values in self._rows.items()}
+    def cut(self) -> None:
+        """Whoever resets the environments from outside says so: what was added last is not continued by what comes next."""
+        if self._n_added:
+            self._cut(np.ones(self.n_envs, dtype=bool))
+
+    def _cut_what_does_not_continue(self, rows: Rows) -> None:
+        """Where an episode goes on from another observation than it reached, someone did not say so."""
+        self._cut(np.any([np.any(rows[group] != values[self.pos], axis=1) for group, values in self._rows.items()], axis=0))
+
+    def _cut(self, envs: np.ndarray) -> None:
+        """
+        :param envs: whether to cut what was added last, unless it ends an episode anyway, shape (n_envs,)
+        """
         previous = (self._n_added - 1) % self.n_rows
-        differs = np.any([np.any(rows[group] != newest[group], axis=1) for group in rows], axis=0)
-        cut = np.flatnonzero(differs & (self.endings[previous] == 0))
+        cut = np.flatnonzero(envs & (self.endings[previous] == 0))
         self.endings[previous, cut] = CUT
-        self._keep_finals(cut, newest, self._n_added - 1)
+        self._keep_finals(cut, {group: values[self.pos] for group, values in self._rows.items()}, self._n_added - 1)
 
     def _keep_finals(self, envs: np.ndarray, rows: Rows, step: int) -> None:
         if len(envs):

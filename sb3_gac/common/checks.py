@@ -1,72 +1,185 @@
 """Checks of what users and environments hand in; each error names the culprit and the remedy."""
 
+import math
 from collections.abc import Mapping
+from numbers import Integral
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 
 class UnsupportedActionSpaceError(AssertionError, ValueError):
     """The algorithm can't act in this action space. SB3 raises AssertionError here, so this is one as well."""
 
 
-def check_positive(name: str, value: Any, remedy: str = "", bound: str = "> 0") -> None:
+# --- arguments ----------------------------------------------------------------------------------------------------------
+
+
+def check_positive(name: str, value: Any, remedy: str = "") -> None:
     """
-    :raises ValueError: unless ``value`` is a finite number > 0; the message says ``bound``
+    :raises ValueError: unless ``value`` is a finite number > 0
     """
-    try:
-        positive = 0 < float(value) < float("inf")
-    except (TypeError, ValueError):
-        positive = False
-    if not positive:
-        raise ValueError(f"{name} must be a number {bound}{', ' + remedy if remedy else ''}, got {value!r}.")
+    _check_number(name, value, 0 < _number(value) < math.inf, "> 0", remedy)
 
 
 def check_not_negative(name: str, value: Any, remedy: str = "") -> None:
     """
     :raises ValueError: unless ``value`` is a finite number >= 0
     """
-    if value != 0:
-        check_positive(name, value, remedy, bound=">= 0")
+    _check_number(name, value, 0 <= _number(value) < math.inf, ">= 0", remedy)
+
+
+def check_fraction(name: str, value: Any) -> None:
+    """
+    :raises ValueError: unless ``value`` is a number in [0, 1]
+    """
+    _check_number(name, value, 0 <= _number(value) <= 1, "from 0 to 1")
+
+
+def _number(value: Any) -> float:
+    try:
+        return math.nan if isinstance(value, str) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def _check_number(name: str, value: Any, allowed: bool, bound: str, remedy: str = "") -> None:
+    if not allowed:
+        raise ValueError(f"{name} must be a number {bound}{', ' + remedy if remedy else ''}, got {value!r}.")
+
+
+def check_integer(name: str, value: Any, low: int, high: float = math.inf, remedy: str = "") -> None:
+    """
+    :raises ValueError: unless ``value`` is a whole number from ``low`` to ``high``
+    """
+    if not (isinstance(value, Integral) and low <= int(value) <= high):
+        bound = f">= {low}" if high == math.inf else f"from {low} to {high}"
+        raise ValueError(f"{name} must be an integer {bound}{', ' + remedy if remedy else ''}, got {value!r}.")
+
+
+def check_range(name: str, value: Any, above: float = -math.inf) -> tuple[float, float]:
+    """
+    :raises ValueError: unless ``value`` is a pair of numbers with ``above`` < low < high
+    """
+    try:
+        low, high = (_number(bound) for bound in value)
+    except (TypeError, ValueError):
+        low, high = math.nan, math.nan
+    if not above < low < high < math.inf:
+        bound = "low < high" if above == -math.inf else f"{above:g} < low < high"
+        raise ValueError(f"{name} must be a pair (low, high) with {bound}, got {value!r}.")
+    return low, high
 
 
 def check_choice(name: str, value: Any, choices: Any) -> None:
     """
     :raises ValueError: unless ``value`` is one of ``choices``
     """
-    if value not in choices:
+    if value not in tuple(choices):
         raise ValueError(f"{name} must be one of {sorted(choices)}, got {value!r}.")
 
 
-def check_finite_observation(entries: Any, what: str = "The observation's entry") -> None:
+def check_type(name: str, value: Any, types: type | tuple[type, ...], expected: str) -> None:
     """
-    :param entries: name -> values with one row per environment
-    :param what: the entries' kind, for the message
-    :raises ValueError: if a value is NaN or infinite
+    :raises ValueError: unless ``value`` is an instance of ``types``; the message says what is ``expected``
     """
-    for name, values in entries.items():
-        finite = np.isfinite(values)
-        if not finite.all():
-            row = int(np.argwhere(~finite)[0][0])
-            raise ValueError(
-                f'{what} "{name}" of environment {row} holds NaN or infinite values; it was not stored. '
-                "Check the environment's simulation and its wrappers; learn(..., reset_num_timesteps=False) goes on "
-                "from a reset environment."
-            )
+    if not isinstance(value, types):
+        raise ValueError(f"{name} must be {expected}, got {value!r}.")
 
 
-def check_terminal_observations(dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+def check_schedule(name: str, value: Any, remedy: str = "or a schedule") -> None:
     """
-    :param dones: shape (n_envs,)
-    :param infos: one per environment; where done, "terminal_observation" is the episode's last observation
-    :raises ValueError: if a value of it is NaN or infinite
+    :raises ValueError: unless ``value`` is a number > 0, or a schedule, which may begin or end at zero
     """
-    for index in np.flatnonzero(dones):
-        terminal = infos[index].get("terminal_observation")
-        if isinstance(terminal, Mapping):
-            for name, values in terminal.items():
-                if not np.isfinite(values).all():
-                    raise ValueError(
-                        f'The last observation\'s entry "{name}" of environment {index} holds NaN or infinite values; '
-                        "it was not stored. Check the environment's simulation and its wrappers."
-                    )
+    if not callable(value):
+        check_positive(name, value, remedy)
+        return
+    for progress_remaining, when in ((1.0, "start"), (0.0, "end")):
+        check_not_negative(f"{name} at the {when} of training", value(progress_remaining))
+
+
+# --- spaces and what environments return --------------------------------------------------------------------------------
+
+
+def check_same_spaces(kind: str, known: spaces.Space, given: spaces.Space, whose: str) -> None:
+    """
+    :param kind: "Observation" or "Action"
+    :param known: the model's
+    :param given: another one
+    :param whose: the other one is, for the message
+    :raises ValueError: naming each entry that differs
+    """
+    if known == given:
+        return
+    differences = [f"the {whose} has {given}, the model {known}"]
+    if isinstance(known, spaces.Dict) and isinstance(given, spaces.Dict):
+        names = dict.fromkeys([*known.spaces, *given.spaces])
+        pairs = {name: (known.spaces.get(name), given.spaces.get(name)) for name in names}
+        differences = [
+            f'entry "{name}" is {theirs or "missing"} in the {whose}, {ours or "missing"} in the model'
+            for name, (ours, theirs) in pairs.items()
+            if ours != theirs
+        ]
+    raise ValueError(f"{kind} spaces do not match: {'; '.join(differences)}.")
+
+
+def index_bounds(space: spaces.Space) -> tuple[Any, Any] | None:
+    """Smallest and largest value of entries that are counted with; ``None`` for those that are measured."""
+    if isinstance(space, spaces.Discrete):
+        return space.start, space.start + space.n - 1
+    if isinstance(space, spaces.MultiDiscrete):
+        return space.start, space.start + space.nvec - 1
+    return (0, 1) if isinstance(space, spaces.MultiBinary) else None
+
+
+def fault_of(value: Any, space: spaces.Space) -> str | None:
+    """
+    :param value: what one environment returned as an entry of this space
+    :param space: with a shape
+    :return: what is wrong with it, in words; ``None`` if nothing is
+    """
+    try:
+        array = np.asarray(value)
+    except ValueError:  # nested lists of different lengths
+        return f"is not an array: {value!r:.80}"
+    if array.dtype.kind not in "biuf":
+        return f"is of type {type(value).__name__}, expected numbers of type {space.dtype} and shape {space.shape}"
+    if array.shape != space.shape:
+        return f"has shape {array.shape}, expected {space.shape}"
+    if not np.isfinite(array).all():
+        return "holds NaN or infinite values"
+    if not _held_by(space.dtype, array):
+        return f"has type {array.dtype} and values that the expected {space.dtype} can't hold"
+    bounds = index_bounds(space)
+    if bounds is not None and not ((array >= bounds[0]) & (array <= bounds[1])).all():
+        return f"holds {array.tolist()}, which is not in {space}"
+    return None
+
+
+def is_finite(array: np.ndarray, dtype: Any) -> bool:
+    """
+    :param array: of numbers
+    :param dtype: in which they will be stored
+    :return: whether all are finite there
+    """
+    if dtype.kind == "f" and array.dtype != dtype:
+        with np.errstate(over="ignore"):
+            array = array.astype(dtype)
+    return bool(np.isfinite(array).all())
+
+
+def _held_by(dtype: Any, array: np.ndarray) -> bool:
+    """Whether nothing but precision is lost in this type."""
+    if dtype.kind == "f":
+        return is_finite(array, dtype)
+    with np.errstate(invalid="ignore"):
+        return bool((array.astype(dtype) == array).all())
+
+
+def entries_of(observation: Any) -> Mapping[str, Any]:
+    """
+    :param observation: of a Dict space or any other
+    :return: its entries; what is no Dict is one entry, "observation"
+    """
+    return observation if isinstance(observation, Mapping) else {"observation": observation}

@@ -79,8 +79,8 @@ class TanhGaussian(NamedTuple):
         return TanhGaussian(self.mean, lender.log_std.detach())
 
     def diagnostics(self) -> dict[str, th.Tensor]:
-        """Name -> scalar to log, detached."""
-        return {"std": self.log_std.detach().exp().mean(), "mean_abs": self.mean.detach().abs().mean()}
+        """Name -> what to log the average of, detached, shape (\\*E)."""
+        return {"std": self.log_std.detach().exp().mean(dim=-1), "mean_abs": self.mean.detach().abs().mean(dim=-1)}
 
     def log_prob(self, pre_tanh: th.Tensor) -> th.Tensor:
         """
@@ -153,8 +153,8 @@ class Categorical(NamedTuple):
         return self
 
     def diagnostics(self) -> dict[str, th.Tensor]:
-        """Name -> scalar to log, detached."""
-        return {"max_prob": self.logits.detach().softmax(dim=-1).amax(dim=-1).mean()}
+        """Name -> what to log the average of, detached, shape (\\*E)."""
+        return {"max_prob": self.logits.detach().softmax(dim=-1).amax(dim=-1)}
 
 
 Distribution: TypeAlias = TanhGaussian | Categorical

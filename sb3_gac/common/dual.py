@@ -5,6 +5,7 @@ from typing import Any
 
 import torch as th
 
+from sb3_gac.common.checks import check_range
 from sb3_gac.common.flat import FlatAdam
 from sb3_gac.common.losses import dual_loss
 
@@ -101,26 +102,13 @@ def make_coefficient(
     :raises ValueError: if ``spec`` or ``bounds`` is none of what is allowed
     """
     remedy = f'{name} must be "auto", "auto_<start value>" such as "auto_0.5", or a number >= 0, got {spec!r}.'
-    low, high = check_bounds(f"{name}_bounds", bounds)
+    low, high = check_range(f"{name}_bounds", bounds, above=0.0)
     if not (isinstance(spec, str) and spec.startswith("auto")):
         return FixedCoefficient(_parse(spec, remedy, allow_zero=True), device)
     initial = auto_value if spec == "auto" else _parse(spec.removeprefix("auto_"), remedy, allow_zero=False)
     if spec != "auto" and not low <= initial <= high:
         raise ValueError(f"The start value of {name}={spec!r} lies outside {name}_bounds={bounds}.")
     return DualVariable(name, min(max(initial, low), high), (low, high), learning_rate, device)
-
-
-def check_bounds(name: str, bounds: Any) -> tuple[float, float]:
-    """
-    :raises ValueError: unless ``bounds`` are two numbers with 0 < low < high
-    """
-    try:
-        low, high = (float(bound) for bound in bounds)
-    except (TypeError, ValueError):
-        low, high = 0.0, 0.0
-    if not 0 < low < high < math.inf:
-        raise ValueError(f"{name} must be a pair (low, high) with 0 < low < high, got {bounds!r}.")
-    return low, high
 
 
 def _parse(text: Any, remedy: str, allow_zero: bool) -> float:

@@ -98,6 +98,18 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         super().reset()
         self._forget_episodes()
 
+    def bookkeeping(self) -> dict[str, Any]:
+        """See :meth:`CompactDictReplayBuffer.bookkeeping`."""
+        return super().bookkeeping() | {"episodes": self._episodes.since(0), "starts": self._episode_starts.copy()}
+
+    def restore_bookkeeping(self, state: dict[str, Any]) -> None:
+        """See :meth:`CompactDictReplayBuffer.restore_bookkeeping`."""
+        super().restore_bookkeeping(state)
+        self._episodes = EpisodeIndex()
+        for episode in state["episodes"].tolist():
+            self._episodes.append(*episode)
+        self._episode_starts = state["starts"]
+
     def add(  # type: ignore[override]
         self,
         obs: Mapping[str, np.ndarray],
@@ -109,13 +121,32 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
     ) -> None:
         """See :meth:`CompactDictReplayBuffer.add`."""
         super().add(obs, next_obs, action, reward, done, infos)
-        newest = self._n_added - 1
-        for step in (newest - 1, newest):  # the one before may have been cut by a reset from outside
-            if step >= 0:
-                ended = (self.endings[step % self.n_rows] != 0) & (self._episode_starts <= step)
-                for env in np.flatnonzero(ended).tolist():
-                    self._episodes.append(env, self._episode_starts[env], step + 1 - self._episode_starts[env])
-                    self._episode_starts[env] = step + 1
+        self._index_ended(self._n_added - 2)  # may have been cut
+        self._index_ended(self._n_added - 1)
+
+    def cut(self) -> None:
+        """See :meth:`CompactDictReplayBuffer.cut`."""
+        super().cut()
+        self._index_ended(self._n_added - 1)
+
+    def _index_ended(self, step: int) -> None:
+        """
+        :param step: one of the last two, or -1: episodes that end with it count from now on
+        """
+        if step < 0:
+            return
+        ended = (self.endings[step % self.n_rows] != 0) & (self._episode_starts <= step)
+        for env in np.flatnonzero(ended).tolist():
+            self._episodes.append(env, self._episode_starts[env], step + 1 - self._episode_starts[env])
+            self._episode_starts[env] = step + 1
+
+    @property
+    def n_episodes(self) -> int:
+        """Whole episodes that can be sampled."""
+        return len(self._whole_episodes())
+
+    def _whole_episodes(self) -> np.ndarray:
+        return self._episodes.since(self._n_added - self.size())
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceSamples:  # type: ignore[override]
         """
@@ -124,7 +155,7 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         :return: tensors on the buffer's device
         :raises ValueError: if no episode is whole
         """
-        episodes = self._episodes.since(self._n_added - self.size())
+        episodes = self._whole_episodes()
         if not len(episodes):
             raise ValueError(
                 f"The replay buffer holds no whole episode among its last {self.size() * self.n_envs} transitions: raise "

@@ -1,8 +1,9 @@
 """
 A network's parameters end to end in one tensor.
 
-An optimiser, a gradient norm, its clipping and a target's Polyak average each cost some calls for every tensor of a
-network, which at 256 units and less take as long as their arithmetic.  On one flat tensor each is a single call.
+An optimiser and a target's Polyak average each cost some calls for every tensor of a network, which at 256 units and less
+take as long as their arithmetic.  On one flat tensor each is a single call.  A gradient's norm and its clipping go tensor by
+tensor nevertheless, before they are joined: that is what compiles into fast kernels.
 """
 
 import itertools

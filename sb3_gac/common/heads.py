@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_gac.common.checks import UnsupportedActionSpaceError
+from sb3_gac.common.checks import UnsupportedActionSpaceError, check_range
 from sb3_gac.common.distributions import Categorical, TanhGaussian
 from sb3_gac.common.losses import log_std_loss
 from sb3_gac.common.networks import Head
@@ -119,6 +119,7 @@ def make_head(latent_dim: int, action_space: spaces.Space, log_std_bounds: tuple
     if isinstance(action_space, spaces.Discrete):
         return CategoricalHead(latent_dim, action_space)
     assert isinstance(action_space, spaces.Box)
+    check_range("log_std_bounds", log_std_bounds)
     return GaussianHead(latent_dim, action_space, log_std_bounds)
 
 
@@ -157,6 +158,9 @@ def resolve_target_entropy(target_entropy: Any, action_space: spaces.Space) -> f
     if isinstance(target_entropy, str) and target_entropy in named:
         return named[target_entropy]
     try:
-        return float(target_entropy)
+        number = float(target_entropy)
     except (TypeError, ValueError):
-        raise ValueError(f'target_entropy must be "auto", "sac" or a number, got {target_entropy!r}.') from None
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f'target_entropy must be "auto", "sac" or a number, got {target_entropy!r}.')
+    return number

@@ -1,7 +1,7 @@
 """Building blocks of the policies: an ensemble of Q-networks evaluated at once."""
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -96,21 +96,31 @@ class RoleModel(BaseModel):
             leading = list(next(iter(entries.values())).shape[:2])
             entries = {key: value.flatten(0, 1) for key, value in entries.items()}
         features = extractor(preprocess_obs(entries, space, normalize_images=self.normalize_images))
-        return features.unflatten(0, leading) if leading else features
+        # not unflatten, which ONNX would do for the example's batch alone
+        return features.reshape(*leading, -1) if leading else features
+
+
+def in_float32(layer: Callable[[th.Tensor], th.Tensor], x: th.Tensor) -> th.Tensor:
+    """
+    :param layer: one that stays in float32 where the layers before it are in mixed precision
+    :param x: its input
+    :return: its output
+    """
+    if not th.is_autocast_enabled(x.device.type):
+        return layer(x)
+    with th.autocast(x.device.type, enabled=False):
+        return layer(x.float())
 
 
 class Head(nn.Linear):
-    """A last layer, which stays in float32 where the layers before it are in mixed precision."""
+    """A last layer, in float32."""
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
         :param x: shape (B, F)
         :return: shape (B, H)
         """
-        if not th.is_autocast_enabled(x.device.type):
-            return super().forward(x)
-        with th.autocast(x.device.type, enabled=False):
-            return super().forward(x.float())
+        return in_float32(super().forward, x)
 
 
 class EnsembleLinear(nn.Module):
@@ -134,6 +144,17 @@ class EnsembleLinear(nn.Module):
         :return: shape (N, B, H)
         """
         return th.bmm(x, self.weight) + self.bias
+
+
+class EnsembleHead(EnsembleLinear):
+    """Last layers of an ensemble, in float32."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: shape (N, B, F)
+        :return: shape (N, B, H)
+        """
+        return in_float32(super().forward, x)
 
 
 class EnsembleInput(nn.Module):
@@ -305,7 +326,7 @@ class DiscreteCriticEnsemble(CriticEnsemble):
         n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
         widths = [features_dim, *self.net_arch]
         self.input = EnsembleLinear(self.n_critics, features_dim, widths[1]) if self.net_arch else None
-        self.output = EnsembleLinear(self.n_critics, widths[-1], n_actions)
+        self.output = EnsembleHead(self.n_critics, widths[-1], n_actions)
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor:
         r"""

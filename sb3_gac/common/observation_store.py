@@ -1,6 +1,7 @@
 """Where a replay buffer keeps dict observations: each once, all entries of a row side by side."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -82,6 +83,18 @@ class FinalObservations:
     def nbytes(self) -> int:
         """Bytes allocated."""
         return self._times.nbytes + sum(rows.nbytes for rows in self._rows.values())
+
+    def state(self) -> dict[str, Any]:
+        """What is kept, copied."""
+        kept = slice(self._first, self._end)
+        return {"times": self._times[kept].copy(), "rows": {group: rows[kept].copy() for group, rows in self._rows.items()}}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state`
+        """
+        self._times, self._rows = state["times"], state["rows"]
+        self._first, self._end = 0, len(self._times)
 
     def append(self, times: np.ndarray, rows: Rows) -> None:
         """

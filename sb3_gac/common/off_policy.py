@@ -6,31 +6,29 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from typing_extensions import Self
 
+from sb3_gac.common.arguments import check_shared_arguments, check_what_construction_needs
 from sb3_gac.common.buffers import CompactDictReplayBuffer
-from sb3_gac.common.checks import (
-    check_finite_observation,
-    check_positive,
-    check_terminal_observations,
-)
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
+from sb3_gac.common.env_guard import RAW_FINAL
 from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_sequences
+from sb3_gac.common.guard import DeploymentGuard
 from sb3_gac.common.heads import check_action_space, resolve_target_entropy
 from sb3_gac.common.parallel import has_side_effects
 from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
+from sb3_gac.common.resuming import ResumableAlgorithm
 from sb3_gac.common.roles import RoleKeys, resolve_lr_scales, resolve_role_keys
-from sb3_gac.common.training import NetworkTraining
 
 ENT_COEF_START = 0.1
 ENT_COEF_BOUNDS = (1e-8, 1e4)
 
 
-class AsymmetricOffPolicyAlgorithm(NetworkTraining):
+class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
 
@@ -111,6 +109,7 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
+        check_what_construction_needs(device, verbose)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -183,21 +182,17 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         """
         :raises ValueError: naming the argument and the remedy
         """
+        if not (isinstance(self.policy_class, type) and issubclass(self.policy_class, AsymmetricPolicy)):
+            names = list(self.policy_aliases)
+            raise ValueError(f"policy must be one of {names} or a subclass of their classes, got {self.policy_class!r}.")
+        if not hasattr(self, "observation_space"):
+            raise ValueError("env must be an environment, got None: load() alone can do without.")
         check_action_space(type(self).__name__, self.action_space)
-        if self.action_noise is not None and not isinstance(self.action_space, spaces.Box):
-            raise ValueError("action_noise can be added to Box actions only: leave it out.")
+        check_shared_arguments(self)
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
         if self.policy_class.cell is not None:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
-        if self.replay_buffer_class in (ReplayBuffer, NStepReplayBuffer):
-            raise ValueError(
-                f"replay_buffer_class={self.replay_buffer_class.__name__} can't hold Dict observations: "
-                "leave it out, or give DictReplayBuffer or a subclass."
-            )
-        check_positive("target_update_interval", self.target_update_interval)
-        if self.max_grad_norm is not None:
-            check_positive("max_grad_norm", self.max_grad_norm, remedy="or None for no clipping")
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
 
     def _policy_options(self) -> dict[str, Any]:
@@ -278,19 +273,6 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         """
         return self.policy.unscale_action(action) if isinstance(self.action_space, spaces.Box) else action
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, Any]:
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        assert isinstance(self._last_obs, dict)
-        self._forget_episode_on_error(check_finite_observation, self._last_obs)
-        return result
-
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
@@ -300,20 +282,18 @@ class AsymmetricOffPolicyAlgorithm(NetworkTraining):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        raw_obs = new_obs if self._vec_normalize_env is None else self._vec_normalize_env.get_original_obs()
-        self._forget_episode_on_error(check_finite_observation, raw_obs)
-        self._forget_episode_on_error(check_finite_observation, {"reward": reward}, what="The environment's")
-        self._forget_episode_on_error(check_terminal_observations, dones, infos)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self._last_episode_starts = dones
-
-    def _forget_episode_on_error(self, check: Any, *args: Any, **kwargs: Any) -> None:
-        """A refused observation ends the episode: the next ``learn()`` resets the environment and keeps the rest."""
-        try:
-            check(*args, **kwargs)
-        except ValueError:
-            self._last_obs = None
-            raise
+        finals = {index: infos[index].get(RAW_FINAL) for index in np.flatnonzero(dones)}
+        if self._vec_normalize_env is None or None in finals.values():
+            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+            return
+        # SB3 would take an episode's last observation from VecNormalize and undo that, which leaves it clipped and rounded
+        next_obs, raw_reward = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
+        for index, final in finals.items():
+            for key, values in next_obs.items():  # type: ignore[union-attr]
+                values[index] = final[key]  # type: ignore[index]
+        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, raw_reward, dones, infos)  # type: ignore[arg-type]
+        self._last_obs, self._last_original_obs = new_obs, self._vec_normalize_env.get_original_obs()
 
     def learn(
         self,

@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy
+from sb3_gac.common.checks import check_integer
 from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.flat import FlatAdam, FlatParameters
 from sb3_gac.common.memory import Memory
@@ -83,6 +84,8 @@ class AsymmetricPolicy(BasePolicy):
             squash_output=isinstance(action_space, spaces.Box),
             normalize_images=normalize_images,
         )
+        check_integer("n_critics", n_critics, 1)
+        check_integer("rnn_hidden_size", rnn_hidden_size, 1)
         self.constructor_options: dict[str, Any] = {
             "net_arch": net_arch,
             "activation_fn": activation_fn,

@@ -5,7 +5,7 @@ from typing import NamedTuple, TypeVar
 
 from gymnasium import spaces
 
-from sb3_gac.common.checks import check_positive
+from sb3_gac.common.checks import check_integer, check_positive
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 
 CRITICS = "critic"
@@ -111,20 +111,23 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
     :param net_arch: one list for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each policy and one
         for "critic"; ``None`` for [256, 256]
     :return: role -> sizes, for all roles
-    :raises ValueError: if the names are of neither form
+    :raises ValueError: if the names are of neither form, or a size is no integer above 0
     """
     if net_arch is None:
         net_arch = [256, 256]
-    if isinstance(net_arch, list):
-        return dict.fromkeys(roles.all, net_arch)
     policies = roles.policies
-    if set(net_arch) == {"pi", "qf"}:
+    if isinstance(net_arch, list):
+        net_arch = {**dict.fromkeys(policies, net_arch), "critic": net_arch}
+    if isinstance(net_arch, Mapping) and set(net_arch) == {"pi", "qf"}:
         net_arch = {**dict.fromkeys(policies, net_arch["pi"]), "critic": net_arch["qf"]}
-    if set(net_arch) != {*policies, "critic"}:
+    if not isinstance(net_arch, Mapping) or set(net_arch) != {*policies, "critic"}:
         raise ValueError(
             f'net_arch must be a list, {{"pi": [...], "qf": [...]}} or one list for each of {[*policies, "critic"]}, '
             f"got {net_arch!r}."
         )
+    for sizes in net_arch.values():
+        for size in sizes:
+            check_integer("net_arch: a layer's size", size, 1)
     return {role: net_arch[role if role in policies else "critic"] for role in roles.all}
 
 

@@ -1,16 +1,19 @@
 """The train loop, and what a gradient step is put together from."""
 
+import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.common.compilation import Program
-from sb3_gac.common.episodes import SequenceSamples
+from sb3_gac.common.divergence import check_finite_metrics
+from sb3_gac.common.episodes import EpisodeReplayBuffer, SequenceSamples
+from sb3_gac.common.faults import FaultTolerance
 from sb3_gac.common.losses import critic_loss, masked_mean
 from sb3_gac.common.parallel import halved_threads, run_halves
 from sb3_gac.common.policies import AsymmetricPolicy
@@ -84,7 +87,7 @@ class Descent(NamedTuple):
     metrics: Metrics
 
 
-class NetworkTraining(OffPolicyAlgorithm):
+class NetworkTraining(FaultTolerance):
     """
     ``train`` for networks that are laid out flat, each with its optimiser: a subclass writes one gradient step.
 
@@ -103,12 +106,17 @@ class NetworkTraining(OffPolicyAlgorithm):
     program_key: tuple[Any, ...]
     _halves_are_independent: bool
     _halves_together = False
+    #: Of the last round of gradient steps, all finite
+    _last_metrics: Mapping[str, float] = MappingProxyType({})
+    _waiting = False
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """
         :param gradient_steps: number of gradient steps
         :param batch_size: transitions per step, B
         """
+        if self._waits_for_an_episode():
+            return
         self.policy.set_training_mode(True)
         self.policy.refresh_parameters()
         self._update_learning_rate(self._scheduled_optimizers())
@@ -117,6 +125,19 @@ class NetworkTraining(OffPolicyAlgorithm):
         with halved_threads(self._halves_together):
             history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
         self._record_metrics(history)
+
+    def _waits_for_an_episode(self) -> bool:
+        """Whether there is nothing yet to learn from; said once. (A full buffer without a whole episode is an error.)"""
+        buffer = self.replay_buffer
+        waits = isinstance(buffer, EpisodeReplayBuffer) and not buffer.full and buffer.n_episodes == 0
+        if waits and not self._waiting:
+            warnings.warn(
+                "There are no gradient steps until the first episode has ended, although "
+                f"learning_starts={self.learning_starts} is over: a recurrent policy learns from whole episodes.",
+                stacklevel=3,
+            )
+        self._waiting = waits
+        return waits
 
     def _one_update(self, batch_size: int, diagnose: bool) -> Metrics:
         metrics = self._gradient_step(self._sample_batch(batch_size), diagnose)
@@ -200,6 +221,10 @@ class NetworkTraining(OffPolicyAlgorithm):
         )
 
     @abstractmethod
+    def _dual_names(self) -> list[str]:
+        """Attributes that hold coefficients."""
+
+    @abstractmethod
     def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
         """Optimisers that follow ``learning_rate``."""
 
@@ -211,7 +236,12 @@ class NetworkTraining(OffPolicyAlgorithm):
                 group["lr"] *= group.get("lr_scale", 1.0)
 
     def _record_metrics(self, history: list[Metrics]) -> None:
-        """Log means over the gradient steps of one ``train()``, and diagnostics of the last: the only host transfer."""
+        """
+        Log means over the gradient steps of one ``train()``, and diagnostics of the last: the only host transfer.
+
+        :param history: of each gradient step
+        :raises DivergenceError: if a metric is not finite
+        """
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if not history:
             return
@@ -224,3 +254,6 @@ class NetworkTraining(OffPolicyAlgorithm):
         values["critic_loss"] = sum(value for name, value in values.items() if name.endswith("critic_loss"))
         for name, value in values.items():
             self.logger.record(f"train/{name}", value)
+        coefficients = {name.removesuffix("_dual"): getattr(self, name).value for name in self._dual_names()}
+        check_finite_metrics(self, values, self._last_metrics, coefficients)
+        self._last_metrics = values

@@ -2,11 +2,13 @@
 
 from sb3_gac.envs.actions import FlattenMultiDiscrete
 from sb3_gac.envs.mujoco import make_mujoco, register_mujoco
+from sb3_gac.envs.pendulum import make_pendulum, register_pendulum
 from sb3_gac.envs.popgym import make_popgym, register_popgym
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDictObservation, SplitObservation
 
 register_mujoco()
+register_pendulum()
 register_popgym()
 
 __all__ = [
@@ -19,7 +21,9 @@ __all__ = [
     "SplitDictObservation",
     "SplitObservation",
     "make_mujoco",
+    "make_pendulum",
     "make_popgym",
     "register_mujoco",
+    "register_pendulum",
     "register_popgym",
 ]

@@ -17,31 +17,11 @@ Swimmer                  qpos[2:] 3, qvel 5                                    3
 are equivalents of the paper's Brax tasks, not reproductions: time step and control ranges are gymnasium's.
 """
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
 
-from sb3_gac.envs.wrappers import SensorNoise, SplitObservation
-
-PRIVILEGED_CHOICES = ("state", "velocity")
-
-
-@dataclass(frozen=True)
-class TaskLayout:
-    """
-    Where a task's observation holds what.
-
-    :param env_id: gymnasium's id
-    :param partial: indices of positions and other quantities without velocities
-    :param velocity: indices of velocities
-    :param kwargs: of ``gymnasium.make``
-    """
-
-    env_id: str
-    partial: tuple[int, ...]
-    velocity: tuple[int, ...]
-    kwargs: dict[str, Any] = field(default_factory=dict)
+from sb3_gac.envs.layout import TaskLayout, make_task
 
 
 def _positions_first(env_id: str, n_positions: int, n_velocities: int, **kwargs: Any) -> TaskLayout:
@@ -80,15 +60,10 @@ def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", **
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
-    if privileged not in PRIVILEGED_CHOICES:
-        raise ValueError(f"privileged must be one of {list(PRIVILEGED_CHOICES)}, got {privileged!r}.")
     misplacing = sorted(name for name in kwargs if name.endswith("_observation"))
     if misplacing:
         raise ValueError(f"{misplacing} would change the observation, of which the split is made by position.")
-    layout = TASKS[task]
-    env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs}).unwrapped
-    visible = layout.velocity if privileged == "velocity" else tuple(sorted((*layout.partial, *layout.velocity)))
-    return SensorNoise(SplitObservation(env, layout.partial, visible), noise_std)
+    return make_task(TASKS[task], noise_std, privileged, **kwargs)
 
 
 def register_mujoco() -> None:

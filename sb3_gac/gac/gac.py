@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_gac.common.checks import check_choice, check_not_negative, check_positive
+from sb3_gac.common.checks import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.common.distributions import KL_REDUCTIONS
 from sb3_gac.common.dual import make_coefficient
 from sb3_gac.common.roles import RoleKeys
@@ -140,10 +140,10 @@ class GAC(GuidedUpdate):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        if not callable(self.target_kl):
-            check_positive("target_kl", self.target_kl, remedy="for example the default 0.0033")
+        check_schedule("target_kl", self.target_kl, remedy="for example the default 0.0033, or a schedule of such")
         check_positive("kl_coef_learning_rate", self.kl_coef_learning_rate)
         check_choice("kl_reduction", self.kl_reduction, KL_REDUCTIONS)
+        check_choice("learner_entropy", self.learner_entropy, (False, True))
         check_choice("guider", self.guider, GUIDERS)
         if self.max_kl is not None:
             check_positive("max_kl", self.max_kl, remedy="or None for no hard bound")

@@ -199,5 +199,5 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
             "kl_coef_on_bound": self.kl_coef_dual.on_bound(),
             "ent_coef": self.ent_coef_dual.value,
             "entropy": -masked_mean(log_prob, mask),
-            **{f"learner_{name}": value for name, value in learner.diagnostics().items()},
+            **{f"learner_{name}": masked_mean(values, mask) for name, values in learner.diagnostics().items()},
         }

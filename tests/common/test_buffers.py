@@ -287,9 +287,47 @@ def test_an_outside_reset_keeps_the_last_transition_whole():
     assert model.replay_buffer.dones[9, 0] == 0
 
 
+class Unchanging(TwoViewBandit):
+    """Every observation is the same."""
+
+    def _draw(self):
+        return {key: np.zeros_like(value) for key, value in super()._draw().items()}
+
+
+def test_learning_again_cuts_an_episode_even_where_no_observation_tells():
+    model = small_model(Unchanging(length=100), learning_starts=1000, n_steps=3)
+    model.learn(5)
+    model.learn(3, reset_num_timesteps=False)
+    assert not model.replay_buffer.endings.any(), "the episode went on"
+    model.learn(5)
+    assert np.flatnonzero(model.replay_buffer.endings[:, 0]).tolist() == [7]
+
+
+def _add(buffer, reward, done=False):
+    constant = {key: np.zeros((buffer.n_envs, *space.shape), space.dtype) for key, space in SPACE.spaces.items()}
+    shape = (buffer.n_envs,)
+    action, infos = np.zeros((*shape, 2)), [{}] * buffer.n_envs
+    buffer.add(constant, constant, action, np.full(shape, reward), np.full(shape, done), infos)
+
+
+def test_no_sum_of_rewards_crosses_a_cut():
+    buffer = _make(10, 2, n_steps=3, gamma=1.0)
+    buffer.cut()
+    for reward in (1.0, 1.0, 1.0):
+        _add(buffer, reward)
+    buffer.cut()
+    buffer.cut()
+    for reward in (100.0, 100.0):
+        _add(buffer, reward, done=True)
+    buffer.cut()
+    assert set(buffer.sample(200).rewards.flatten().tolist()) == {3.0, 2.0, 1.0, 100.0}
+    assert buffer.endings[:5, 0].tolist() == [0, 0, 4, 1, 1]
+    assert len(buffer._finals) == 2 * 3
+
+
 @pytest.mark.parametrize("n_steps", [0, -1])
 def test_bad_n_steps(n_steps):
-    with pytest.raises(ValueError, match="n_steps must be at least 1"):
+    with pytest.raises(ValueError, match="n_steps must be an integer >= 1"):
         small_model(n_steps=n_steps)
 
 

@@ -1,11 +1,13 @@
 """Compiled gradient steps do what plain ones do, notice what changes, and refuse what they can't do."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch as th
 
 from sb3_gac import GAC, AsymmetricSAC
-from tests.helpers import TwoViewBandit, small_model
+from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
 
 
 def _filled(cls, **arguments):
@@ -74,9 +76,12 @@ def test_what_draws_random_numbers_is_refused():
         small_model(compile=True, policy_kwargs={"net_arch": [8], "activation_fn": Dropout})
 
 
+@pytest.mark.parametrize("env", [TwoViewBandit, TwoViewChoice, Recall, partial(Recall, continuous=True)])
 @pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
-def test_mixed_precision_is_near_full_precision_and_keeps_parameters_and_heads_in_it(cls):
-    full, mixed = _filled(cls), _filled(cls, mixed_precision=True)
+def test_mixed_precision_is_near_full_precision_and_keeps_parameters_and_heads_in_it(cls, env):
+    """With numbers for actions and with choices; with a memory and without."""
+    memory = {"policy": "MultiInputGruPolicy"} if isinstance(env(), Recall) else {}
+    full, mixed = (_filled(cls, env=env(), mixed_precision=flag, **memory) for flag in (False, True))
     _train((full, mixed), gradient_steps=1, batch_size=64)
     assert {p.dtype for p in mixed.policy.parameters()} == {th.float32}
     for name in ("actor_loss", "critic_loss"):
@@ -84,5 +89,17 @@ def test_mixed_precision_is_near_full_precision_and_keeps_parameters_and_heads_i
         assert values[0] == pytest.approx(values[1], rel=0.02, abs=0.01)
         assert values[0] != values[1], "nothing was in bfloat16"
     with th.autocast("cpu", th.bfloat16):
-        batch = mixed._sample_batch(4).observations
-        assert {output.dtype for output in mixed.policy.deployed(batch)} == {th.float32}
+        batch = mixed._sample_batch(4)
+        observations = batch.observations if batch.sequence is None else batch.sequence
+        assert {output.dtype for output in mixed.policy.deployed(observations)} == {th.float32}
+
+
+@pytest.mark.parametrize("env", [TwoViewBandit, TwoViewChoice])
+def test_mixed_precision_leaves_the_last_layers_alone(env):
+    policy = small_model(env()).policy
+    x = th.randn(2, 5, 16)
+    last = {"actor": next(policy.deployed.head.children()), "critic": policy.critic.output}
+    for name, layer in last.items():
+        plain = layer(x)
+        with th.autocast("cpu", th.bfloat16):
+            assert th.equal(layer(x), plain), name

@@ -134,6 +134,21 @@ def test_normalised_by_the_environment():
     assert th.equal(normalised.observations["privileged"], plain.observations["privileged"])
 
 
+def test_a_cut_ends_an_episode_even_where_no_observation_tells():
+    buffer = _buffer(n_envs=2)
+    constant = Recorder._entries([0.0, 0.0])
+    for step in range(7):
+        if step in (3, 5):
+            buffer.cut()
+        done = np.array([step == 4, False])
+        buffer.add(constant, constant, np.zeros((2, 1)), np.zeros(2), done, [{}, {}])
+    buffer.cut()
+    whole = [[0, 0, 3], [1, 0, 3], [0, 3, 2], [1, 3, 2], [0, 5, 2], [1, 5, 2]]
+    assert buffer._episodes.since(0).tolist() == whole
+    buffer.add(constant, constant, np.zeros((2, 1)), np.zeros(2), np.ones(2), [{}, {}])
+    assert buffer._episodes.since(0).tolist() == [*whole, [0, 7, 1], [1, 7, 1]]
+
+
 def test_reset_forgets_episodes():
     recorder = Recorder(_buffer())
     recorder.step([TERMINATED])

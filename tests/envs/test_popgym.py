@@ -1,5 +1,7 @@
 """POPGym's games with summaries: what they tell, and what they never do."""
 
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -68,13 +70,32 @@ def test_battleship_tells_guesses_and_on_request_hits_but_no_ship(task):
         assert len(found) < game.board.sum() or not hits, "ships were left to hide"
 
 
-def test_concentration_tells_the_faces_that_were_seen():
+@pytest.mark.parametrize(("level", "n_cards", "n_faces"), [("Easy", 52, 2), ("Medium", 104, 2), ("Hard", 52, 13)])
+def test_concentration_tells_the_faces_that_were_seen(level, n_cards, n_faces):
     seen = {}
-    for game, obs, action, *_ in _play("ConcentrationEasy", _random):
-        faces = obs["privileged"].reshape(52, -1).argmax(axis=1)
-        assert faces.tolist() == [seen.get(position, game.facedown_card) for position in range(52)]
+    for game, obs, action, *_ in _play(f"Concentration{level}", _random):
+        faces = obs["privileged"].reshape(n_cards, n_faces + 1).argmax(axis=1)
+        assert faces.tolist() == [seen.get(position, game.facedown_card) for position in range(n_cards)]
         seen[int(action)] = int(game.deck_idx_type[game.deck.idx[int(action)]])
-    assert len(seen) < 52, "some were never turned"
+    assert len(seen) < n_cards, "some were never turned"
+    assert set(seen.values()) == set(range(n_faces))
+
+
+@pytest.mark.parametrize(("level", "n_cards"), [("Easy", 52), ("Medium", 104), ("Hard", 156)])
+def test_autoencode_tells_no_card_before_all_were_shown_and_then_the_last_one_left(level, n_cards):
+    shown, told = [], []
+    for _, obs, *_ in _play(f"Autoencode{level}", _random):
+        shown.append(int(obs["partial"][2:6].argmax()))
+        told.append(int(obs["privileged"].argmax()))
+    assert told == [4] * (n_cards - 1) + shown[:n_cards][::-1]
+
+
+@pytest.mark.parametrize(("level", "k"), [("Easy", 4), ("Medium", 32), ("Hard", 64)])
+def test_repeat_previous_tells_no_card_before_one_is_due(level, k):
+    shown = []
+    for _, obs, *_ in _play(f"RepeatPrevious{level}", _random):
+        shown.append(int(obs["partial"][:4].argmax()))
+        assert obs["privileged"].argmax() == (shown[-k] if len(shown) >= k else 4)
 
 
 @pytest.mark.parametrize("task", ["MineSweeperEasy", "MineSweeperHard"])
@@ -87,6 +108,65 @@ def test_minesweeper_tells_what_was_viewed_and_no_mine(task):
             assert squares.argmax(axis=1).tolist() == [viewed.get(square, unknown) for square in range(len(squares))]
             if game.hidden_grid.ravel()[action] != 1:
                 viewed[int(action)] = int(game.neighbor_grid.ravel()[action])
+
+
+def _pair_of_cards(env, obs):
+    """The first card that lies face down, and then its like."""
+    deck = env.unwrapped.deck
+    faces = env.unwrapped.deck_idx_type[deck.idx]
+    down = [card for card in range(len(faces)) if card not in deck["face_up_idx"]]
+    turned = deck["in_play_idx"]
+    return next(card for card in down if not turned or (card != turned[0] and faces[card] == faces[turned[0]]))
+
+
+def _always_the_first_square_without_a_mine(env, obs):
+    return int((env.unwrapped.hidden_grid != 1).argmax())
+
+
+@pytest.mark.parametrize(
+    ("game", "choose"),
+    [
+        ("Battleship", lambda env, obs: 0),
+        ("Concentration", lambda env, obs: 0),
+        ("MineSweeper", _always_the_first_square_without_a_mine),
+    ],
+)
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_horizon_is_a_truncation(game, choose, level):
+    steps = list(_play(f"{game}{level}", choose))
+    assert len(steps) == (EXACT | LONGEST)[game][LEVELS.index(level)]
+    assert steps[-1][5:] == (False, True)
+
+
+@pytest.mark.parametrize(
+    ("task", "choose"),
+    [
+        ("BattleshipEasy", lambda env, obs: int((env.unwrapped.board * (1 - env.unwrapped.guesses)).argmax())),
+        ("ConcentrationEasy", _pair_of_cards),
+        ("MineSweeperEasy", lambda env, obs: int((env.unwrapped.hidden_grid == 0).argmax())),
+        ("MineSweeperEasy", lambda env, obs: int((env.unwrapped.hidden_grid == 1).argmax())),  # steps on a mine
+        ("AutoencodeEasy", _random),
+        ("RepeatPreviousEasy", _random),
+    ],
+)
+def test_a_true_end_is_a_termination(task, choose):
+    *before, last = _play(task, choose)
+    assert last[5], "terminated"
+    assert not any(step[5] or step[6] for step in before)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_is_picklable_in_the_middle_of_an_episode(task):
+    env = gym.make(f"sb3_gac/popgym-{task}-v0")
+    env.reset(seed=0)
+    env.step(0)
+    copy = pickle.loads(pickle.dumps(env))
+    for action in (1, 2, 3):
+        (first, *rest), (second, *rest_of_copy) = env.step(action), copy.step(action)
+        assert all(np.array_equal(first[key], second[key]) for key in ("partial", "privileged"))
+        assert rest == rest_of_copy
+        if rest[1]:
+            return
 
 
 def test_the_previous_action_is_seen():

@@ -4,12 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC
+from sb3_gac import InvalidStepError
 from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
 
 
@@ -90,82 +88,98 @@ def test_what_discrete_actions_cannot_have():
         small_model(TwoViewChoice(), action_noise=NormalActionNoise(np.zeros(1), np.ones(1)))
 
 
-@pytest.mark.parametrize("policy", ["MlpPolicy", "CnnPolicy", "Multi"])
-def test_policy_names(policy):
-    with pytest.raises(ValueError, match="MultiInputPolicy"):
-        GAC(policy, TwoViewBandit())
+def _poisoned_model(key, at_step, value=np.nan, normalize=False):
+    """Two environments; in the second the value comes after ``at_step`` steps. Trains from the second step on."""
+    env = DummyVecEnv([lambda: TwoViewBandit(length=5), lambda: _Poisoned(key, at_step, value)])
+    return small_model(VecNormalize(env) if normalize else env, learning_starts=2)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"target_kl": 0}, "target_kl must be a number > 0"),
-        ({"target_kl": -0.1}, "target_kl must be a number > 0"),
-        ({"target_kl": "small"}, "target_kl must be a number > 0"),
-        ({"lr_scales": {"guider": 0}}, r'lr_scales\["guider"\] must be a number > 0'),
-        ({"lr_scales": {"actor": 2.0}}, r"lr_scales names unknown roles \['actor'\]"),
-        ({"learner_kl_scale": -1}, "learner_kl_scale must be a number >= 0"),
-        ({"learner_kl_scale": "full"}, 'learner_kl_scale must be a number >= 0, or "auto"'),
-        ({"max_kl": 0}, "max_kl must be a number > 0, or None"),
-        ({"max_grad_norm": -1}, "max_grad_norm must be a number > 0, or None"),
-        ({"kl_coef": "automatic"}, "kl_coef must be"),
-        ({"kl_coef": -1}, "kl_coef must be"),
-        ({"ent_coef": "auto_zero"}, "ent_coef must be"),
-        ({"kl_coef_bounds": (1, 0.1)}, "kl_coef_bounds must be"),
-        ({"kl_coef_learning_rate": 0}, "kl_coef_learning_rate must be"),
-        ({"kl_reduction": "max"}, r"kl_reduction must be one of \['mean', 'sum'\]"),
-        ({"guider": "teacher"}, r"guider must be one of \['independent', 'residual'\]"),
-        ({"target_entropy": "high"}, 'target_entropy must be "auto", "sac" or a number'),
-        ({"replay_buffer_class": ReplayBuffer}, "replay_buffer_class=ReplayBuffer can't hold Dict"),
-        ({"target_update_interval": 0}, "target_update_interval must be"),
-        ({"role_keys": {"student": ["partial"]}}, r"unknown roles \['student'\]"),
-        ({"role_keys": {"learner": ["touch"]}}, r'role_keys\["learner"\] names unknown.*touch'),
-        ({"role_keys": {"guider": []}}, r'role_keys\["guider"\] must be a non-empty list'),
-        ({"role_keys": {"guider": "partial"}}, r'role_keys\["guider"\] must be a non-empty list'),
-        ({"policy_kwargs": {"net_arch": {"actor": [8]}}}, "net_arch must be"),
-    ],
-    ids=lambda value: str(value)[:40],
-)
-def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        small_model(**arguments)
+def _state(model):
+    """All that a refused step must not have changed."""
+    buffer, arrays = model.replay_buffer, {}
+    arrays |= {f"policy {name}": tensor.numpy() for name, tensor in model.policy.state_dict().items()}
+    arrays |= {f"buffer {name}": values[: buffer.pos] for name, values in buffer.observations.items()}
+    arrays |= {"rewards": buffer.rewards[: buffer.pos], "actions": buffer.actions[: buffer.pos], "steps": model.num_timesteps}
+    if (env := model.get_vec_normalize_env()) is not None:
+        statistics = {**env.obs_rms, "returns": env.ret_rms}
+        arrays |= {
+            f"{name} {what}": getattr(rms, what) for name, rms in statistics.items() for what in ("mean", "var", "count")
+        }
+    return {name: np.array(values) for name, values in arrays.items()}
 
 
-@pytest.mark.parametrize("key", ["partial", "privileged"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("normalize", [False, True], ids=["raw", "VecNormalize"])
+@pytest.mark.parametrize("key", ["partial", "privileged", "reward"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("at_step", [3, 5], ids=["within an episode", "at its end"])
-def test_nan_in_an_observation_is_named_before_it_enters_the_buffer(key, value, at_step):
-    env = DummyVecEnv([TwoViewBandit, lambda: _Poisoned(key, at_step, value)])
-    model = small_model(env, learning_starts=100)
-    with pytest.raises(ValueError, match=rf'entry "{key}" of environment 1 holds NaN'):
+def test_what_is_not_finite_is_named_and_changes_nothing(key, value, at_step, normalize):
+    """Neither buffer nor networks nor VecNormalize's statistics, and training goes on."""
+    model = _poisoned_model(key, at_step, value, normalize)
+    steps_before = 2 * (at_step - 1)
+    with pytest.raises(InvalidStepError, match=rf'"{key}" of environment 1 holds NaN or infinite.*after {steps_before} steps'):
         model.learn(40)
-    stored = model.replay_buffer
-    assert stored.pos == at_step - 1
-    for observations in (stored.observations, stored.next_observations):
-        assert all(np.isfinite(values).all() for values in observations.values())
-    model.learn(40, reset_num_timesteps=False)  # nothing is lost, and training goes on
-    assert stored.pos > at_step
+    twin = _poisoned_model("nothing", at_step, normalize=normalize).learn(steps_before)
+    for name, values in _state(twin).items():
+        np.testing.assert_array_equal(_state(model)[name], values, err_msg=name)
+
+    model.learn(40, reset_num_timesteps=False)
+    assert model.num_timesteps == steps_before + 40
+    assert model.replay_buffer.pos == model.num_timesteps / 2
+    assert all(np.isfinite(values).all() for values in _state(model).values())
 
 
-def test_nan_at_reset_is_named():
-    model = small_model(_Poisoned("partial", 0))
-    with pytest.raises(ValueError, match='entry "partial" of environment 0 holds NaN'):
+@pytest.mark.parametrize("normalize", [False, True], ids=["raw", "VecNormalize"])
+def test_nan_at_reset_is_named(normalize):
+    model = _poisoned_model("partial", 0, normalize=normalize)
+    with pytest.raises(InvalidStepError, match=r'entry "partial" of environment 1 holds NaN.*after 0 steps'):
         model.learn(10)
     assert model.replay_buffer.pos == 0
+    assert model.learn(10).replay_buffer.pos == 5
 
 
-def test_nan_reward_is_named():
-    model = small_model(_Poisoned("reward", 3))
-    with pytest.raises(ValueError, match='"reward" of environment 0 holds NaN'):
+def test_a_normalizer_set_later_is_guarded_too():
+    env = VecNormalize(DummyVecEnv([lambda: _Poisoned("partial", 3)]))
+    model = small_model()
+    model.set_env(env)
+    with pytest.raises(InvalidStepError, match='"partial" of environment 0'):
         model.learn(10)
-    assert model.replay_buffer.pos == 2
+    assert np.isfinite(env.obs_rms["partial"].mean).all()
 
 
-def test_nan_is_found_behind_vec_normalize():
-    """Which would clip an infinite value into a plausible one."""
-    env = VecNormalize(make_vec_env(lambda: _Poisoned("privileged", 3, np.inf), n_envs=1))
-    with pytest.raises(ValueError, match='entry "privileged" of environment 0 holds NaN or infinite'):
-        small_model(env).learn(10)
+class _Noise(ActionNoise):
+    """NaN once, in one call."""
+
+    calls = 0
+
+    def __call__(self):
+        self.calls += 1
+        return np.full(1, np.nan if self.calls == 7 else 0.0)
+
+
+def test_nan_from_action_noise_is_named_before_the_environments_see_it():
+    model = small_model(TwoViewBandit(length=5), action_noise=_Noise())
+    with pytest.raises(InvalidStepError, match=r'"action" of environment 0 holds NaN.*action_noise.*after 6 steps'):
+        model.learn(20)
+    assert model.replay_buffer.pos == 6
+    assert model.learn(20, reset_num_timesteps=False).replay_buffer.pos == 26
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_action_that_is_not_finite_names_its_environment(value, monkeypatch):
+    model = small_model(DummyVecEnv([TwoViewBandit] * 3)).learn(15)
+    actions = np.array([[0.1], [0.2], [value]], dtype=np.float32)
+    monkeypatch.setattr(model, "_sample_action", lambda *args: (actions, actions))
+    with pytest.raises(InvalidStepError, match=r'"action" of environment 2 holds NaN or infinite.*after 15 steps'):
+        model.learn(15, reset_num_timesteps=False)
+    assert model.replay_buffer.pos == 5
+
+
+def test_a_behaviour_policy_that_diverged_is_named():
+    model = small_model(TwoViewBandit(length=5), learning_starts=0, gradient_steps=0)
+    for parameter in model.policy.guider.parameters():
+        parameter.data.fill_(np.nan)
+    with pytest.raises(InvalidStepError, match=r'"action" of environment 0 .*policy diverged'):
+        model.learn(5)
 
 
 def test_predict_names_the_missing_entry():

@@ -1,0 +1,274 @@
+"""What stands before vectorised environments: it names the environment that failed, before its values do harm."""
+
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
+
+from sb3_gac.common.checks import entries_of, fault_of, index_bounds, is_finite
+
+KEPT = "Nothing of this step was stored, and all that was learned before is kept"
+GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
+GUARD = "_environment_guard"
+RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under "terminal_observation"
+REWARD = spaces.Box(-np.inf, np.inf, (), np.float32)
+PATIENCE = 2.0  # seconds that a process whose pipe has closed has to end
+
+
+class InvalidStepError(ValueError):
+    """An observation, a reward or an action does not fit its space or is not finite."""
+
+
+class EnvironmentFailedError(RuntimeError):
+    """An environment raised, or its process died."""
+
+
+FAULTS = (InvalidStepError, EnvironmentFailedError)
+
+
+def guard_environments(env: VecEnv) -> None:
+    """
+    Before ``VecNormalize``, if there is one, learns from them, and before they are stored.
+
+    :param env: gets a guard, unless it has one
+    """
+    normalizer = unwrap_vec_normalize(env)
+    guarded = env if normalizer is None else normalizer.venv
+    if GUARD not in vars(guarded):  # getattr would find that of an environment further in
+        vars(guarded)[GUARD] = EnvironmentGuard(guarded)
+
+
+class EnvironmentGuard:
+    """
+    Takes the place of an instance's ``reset``, ``step_async`` and ``step_wait``.
+
+    It is no wrapper, because SB3 goes through the wrappers of training and evaluation environments side by side
+    (``sync_envs_normalization``) and compares their types: a guard must not show.
+
+    :param env: vectorised environments
+    """
+
+    def __init__(self, env: VecEnv):
+        self.env, self.base = env, env.unwrapped
+        self._spaces = _entry_spaces(env.observation_space)
+        self._base_spaces = _entry_spaces(self.base.observation_space)
+        self._failure: str | None = None
+        self._reset, self._step_async, self._step_wait = env.reset, env.step_async, env.step_wait
+        vars(env).update(reset=self.reset, step_async=self.step_async, step_wait=self.step_wait)
+        if isinstance(self.base, DummyVecEnv) and "_save_obs" not in vars(self.base):
+            self._save_obs = self.base._save_obs
+            vars(self.base)["_save_obs"] = self.save_obs
+        if isinstance(self.base, SubprocVecEnv) and type(self.base.processes[0]).__name__ == "ForkProcess":
+            self.base.remotes = tuple(map(WatchedPipe, self.base.remotes, self.base.processes))
+
+    # --- in the place of the environments' own ------------------------------------------------------------------------
+
+    def reset(self) -> Any:
+        """
+        :return: the environments' observations
+        :raises InvalidStepError: if one does not fit its space or is not finite
+        :raises EnvironmentFailedError: if an environment fails
+        """
+        observation = self._call(self._reset)
+        self._check_observation(observation)
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """
+        :param actions: one for each environment
+        :raises InvalidStepError: if one is not finite
+        :raises EnvironmentFailedError: if an environment's process has died
+        """
+        finite = np.isfinite(actions)
+        if not finite.all():
+            raise InvalidStepError(
+                f'The "action" of environment {np.argwhere(~finite)[0][0]} holds NaN or infinite values; no environment was '
+                "stepped. Check action_noise, if there is one; if not, the behaviour policy diverged: load an earlier state."
+            )
+        self._call(self._step_async, actions)
+
+    def step_wait(self) -> Any:
+        """
+        :return: the environments' observations, rewards, dones and infos
+        :raises InvalidStepError: if one does not fit its space or is not finite
+        :raises EnvironmentFailedError: if an environment fails
+        """
+        observation, rewards, dones, infos = self._call(self._step_wait)
+        self._check_observation(observation)
+        _check_rows('The "reward"', rewards, REWARD)
+        for index in np.flatnonzero(dones).tolist():
+            final = infos[index].get("terminal_observation")
+            if final is not None:
+                _check_entries(final, self._spaces, index, "The last observation's entry")
+                infos[index][RAW_FINAL] = final
+        return observation, rewards, dones, infos
+
+    def save_obs(self, index: int, observation: Any) -> None:
+        """
+        DummyVecEnv would broadcast a wrong shape and cast a wrong type where it copies an observation into its buffer.
+
+        :param index: of the environment
+        :param observation: as it returned it
+        :raises InvalidStepError: if it does not fit its space or is not finite
+        """
+        entries = entries_of(observation)
+        for key, space in self._base_spaces.items():
+            value = entries.get(key)
+            if not (isinstance(value, np.ndarray) and value.shape == space.shape and value.dtype == space.dtype):
+                _check_entries(entries, {key: space}, index)
+        self._save_obs(index, observation)
+
+    # --- checks -------------------------------------------------------------------------------------------------------
+
+    def _check_observation(self, observation: Any) -> None:
+        """One look at each entry of all environments together."""
+        entries = entries_of(observation)
+        for key, space in self._spaces.items():
+            _check_rows(f'The observation\'s entry "{key}"', entries[key], space)
+
+    # --- failures -----------------------------------------------------------------------------------------------------
+
+    def _call(self, method: Callable[..., Any], *args: Any) -> Any:
+        if self._failure is not None:
+            raise EnvironmentFailedError(self._failure)
+        try:
+            return method(*args)
+        except FAULTS:
+            raise
+        except Exception as error:
+            fault = self._explained(error)
+            if fault is None:
+                raise
+            raise fault from error
+
+    def _explained(self, error: Exception) -> Exception | None:
+        """What to raise instead of an error that came out of an environment; ``None`` if it came from elsewhere."""
+        if isinstance(self.base, SubprocVecEnv) and isinstance(error, (EOFError, OSError)):
+            self._failure = _end_processes(self.base)
+            return EnvironmentFailedError(self._failure)
+        for frame, _ in traceback.walk_tb(error.__traceback__):  # SB3's own loops know which environment they are at
+            if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
+                return EnvironmentFailedError(
+                    f"Environment {frame.f_locals['env_idx']} raised {type(error).__name__}: {error} {KEPT}: mend the "
+                    f"environment; {GO_ON}, or set_env(...) first gives the model another one."
+                )
+            if frame.f_code.co_name == "_stack_obs":
+                for number, observation in enumerate(frame.f_locals["obs_list"]):
+                    try:
+                        _check_entries(observation, self._base_spaces, number)
+                    except InvalidStepError as fault:
+                        return fault
+        return None
+
+
+class WatchedPipe:
+    """
+    A pipe to a forked process. One that was forked earlier holds the far end open as well, so that a death does not show in
+    the pipe, and whoever waits for an answer would wait for ever.
+
+    :param pipe: to it
+    :param process: at its far end
+    """
+
+    def __init__(self, pipe: Connection, process: BaseProcess):
+        self._pipe, self._process = pipe, process
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._pipe, name)
+
+    def recv(self) -> Any:
+        """
+        :return: what the process sends
+        :raises EOFError: if it has died
+        """
+        while not self._pipe.poll(PATIENCE):
+            if not self._process.is_alive() and not self._pipe.poll():
+                raise EOFError
+        return self._pipe.recv()
+
+
+def _entry_spaces(space: spaces.Space) -> dict[str, spaces.Space]:
+    """Those of an observation's entries that are single arrays."""
+    entries = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+    return {key: entry for key, entry in entries.items() if entry.shape is not None}
+
+
+def _check_entries(
+    observation: Any, entry_spaces: dict[str, spaces.Space], index: int, what: str = "The observation's entry"
+) -> None:
+    """
+    :param observation: of one environment
+    :param entry_spaces: of its entries
+    :param index: of the environment
+    :param what: the entries' kind, for the message
+    :raises InvalidStepError: naming the entry and the environment
+    """
+    entries = entries_of(observation)
+    for key, space in entry_spaces.items():
+        fault = fault_of(entries[key], space) if key in entries else "is missing"
+        if fault is not None:
+            raise InvalidStepError(_message(f'{what} "{key}"', index, fault))
+
+
+def _check_rows(name: str, rows: Any, space: spaces.Space) -> None:
+    """
+    One look at all environments together; at each by itself only if something may be wrong.
+
+    :param name: for the message
+    :param rows: one for each environment
+    :param space: of a row
+    :raises InvalidStepError: naming the environment
+    """
+    bounds = index_bounds(space)
+    if (
+        isinstance(rows, np.ndarray)
+        and rows.shape[1:] == space.shape
+        and _comes_in(rows.dtype, space.dtype)
+        and is_finite(rows, space.dtype)
+        and (bounds is None or ((rows >= bounds[0]) & (rows <= bounds[1])).all())
+    ):
+        return
+    for index, row in enumerate(rows):
+        fault = fault_of(row, space)
+        if fault is not None:
+            raise InvalidStepError(_message(name, index, fault))
+
+
+def _comes_in(given: Any, expected: Any) -> bool:
+    """Whether the type is the expected one, or one whose numbers a floating-point entry takes as they are."""
+    return given == expected or (expected.kind == "f" and given.kind in "biuf")
+
+
+def _message(name: str, index: int, fault: str) -> str:
+    return (
+        f"{name} of environment {index} {fault}; it was not stored. Check the environment's simulation and its wrappers; "
+        f"{GO_ON}."
+    )
+
+
+def _end_processes(env: SubprocVecEnv) -> str:
+    """
+    Without one of its processes, such an environment can neither be stepped nor closed: the others would wait for ever.
+
+    :param env: of which a process has died
+    :return: which one, and what to do
+    """
+    wait([process.sentinel for process in env.processes], timeout=PATIENCE)
+    codes = {index: process.exitcode for index, process in enumerate(env.processes) if process.exitcode is not None}
+    for process, remote in zip(env.processes, env.remotes, strict=True):
+        process.terminate()
+        process.join(PATIENCE)
+        process.kill()
+        remote.close()
+    env.waiting, env.closed = False, True
+    dead = ", ".join(f"{index} (exit code {code})" for index, code in codes.items()) or "unknown"
+    return (
+        f"The process of environment {dead} died. An exit code of 1 is an exception, whose traceback stands above; a negative "
+        f"one a signal, such as -9 for lack of memory. {KEPT}: the other processes were ended, so give the model new "
+        "environments with set_env(...) and go on with learn(..., reset_num_timesteps=False)."
+    )

@@ -1,0 +1,75 @@
+"""Vectorised environments: what has to be written down of them, so that another process goes on from there."""
+
+from copy import deepcopy
+from typing import Any
+
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize, VecTransposeImage
+
+from sb3_gac.envs.state import NotRestorableError, env_state, restore_env_state
+
+#: Wrapper -> the attributes that change from step to step
+CHANGING: dict[type, tuple[str, ...]] = {
+    VecNormalize: ("obs_rms", "ret_rms", "returns"),
+    VecMonitor: ("episode_returns", "episode_lengths", "episode_count"),
+    VecTransposeImage: (),
+}
+
+
+def vec_env_state(env: VecEnv) -> dict[str, Any]:
+    """
+    :param env: between two steps
+    :return: "wrappers", of those that are known, outermost first, and "episodes", of each environment; where their
+        episodes can't be taken up again, that is ``None`` and "why" says why not
+    """
+    wrappers, inner = _unwrap(env)
+    unknown = [type(wrapper).__name__ for wrapper in wrappers if type(wrapper) not in CHANGING]
+    known = [
+        {attribute: deepcopy(getattr(wrapper, attribute)) for attribute in CHANGING.get(type(wrapper), ())}
+        for wrapper in wrappers
+    ]
+    names = [type(wrapper).__name__ for wrapper in wrappers]
+    try:
+        if unknown:
+            raise NotRestorableError(f"it is not known what the state of {unknown[0]} is")
+        if type(inner) is not DummyVecEnv:
+            raise NotRestorableError(f"the environments of a {type(inner).__name__} are in other processes")
+        episodes, why = [env_state(one) for one in inner.envs], ""
+    except NotRestorableError as error:
+        episodes, why = None, str(error)
+    return {"names": names, "wrappers": known, "episodes": episodes, "why": why}
+
+
+def restore_vec_env_state(env: VecEnv, state: dict[str, Any]) -> str:
+    """
+    :param env: made like the one that the state is of
+    :param state: of :func:`vec_env_state`
+    :return: why the environments could not go on with their episodes; empty if they do
+    """
+    wrappers, inner = _unwrap(env)
+    if [type(wrapper).__name__ for wrapper in wrappers] != state["names"]:
+        raise NotRestorableError(
+            f"env is wrapped in {[type(wrapper).__name__ for wrapper in wrappers]}, but the checkpoint's was wrapped in "
+            f"{state['names']}: wrap it likewise."
+        )
+    for wrapper, attributes in zip(wrappers, state["wrappers"], strict=True):
+        for name, value in attributes.items():
+            setattr(wrapper, name, value)
+    if state["episodes"] is None:
+        return state["why"]
+    try:
+        if type(inner) is not DummyVecEnv:
+            raise NotRestorableError(f"the environments of a {type(inner).__name__} are in other processes")
+        for one, its_state in zip(inner.envs, state["episodes"], strict=True):
+            restore_env_state(one, its_state)
+    except NotRestorableError as error:
+        return str(error)
+    return ""
+
+
+def _unwrap(env: VecEnv) -> tuple[list[VecEnvWrapper], Any]:
+    """Wrappers, outermost first, and what they are around."""
+    wrappers = []
+    while isinstance(env, VecEnvWrapper):
+        wrappers.append(env)
+        env = env.venv
+    return wrappers, env

@@ -1,0 +1,44 @@
+"""Tasks whose observation is split by position: noisy positions, and what only a simulator knows of velocities."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_gac.envs.wrappers import SensorNoise, SplitObservation
+
+PRIVILEGED_CHOICES = ("state", "velocity")
+
+
+@dataclass(frozen=True)
+class TaskLayout:
+    """
+    Where a task's observation holds what.
+
+    :param env_id: gymnasium's id
+    :param partial: indices of positions and other quantities without velocities
+    :param velocity: indices of velocities
+    :param kwargs: of ``gymnasium.make``
+    """
+
+    env_id: str
+    partial: tuple[int, ...]
+    velocity: tuple[int, ...]
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+def make_task(layout: TaskLayout, noise_std: float, privileged: str, **kwargs: Any) -> gym.Env:
+    """
+    Build a task without its time limit.
+
+    :param layout: of the task
+    :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
+    :param privileged: "state" for the whole clean state, "velocity" for velocities alone
+    :param kwargs: of the gymnasium environment
+    :raises ValueError: if ``privileged`` is unknown, or ``noise_std`` negative
+    """
+    if privileged not in PRIVILEGED_CHOICES:
+        raise ValueError(f"privileged must be one of {list(PRIVILEGED_CHOICES)}, got {privileged!r}.")
+    env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs}).unwrapped
+    visible = layout.velocity if privileged == "velocity" else tuple(sorted((*layout.partial, *layout.velocity)))
+    return SensorNoise(SplitObservation(env, layout.partial, visible), noise_std)

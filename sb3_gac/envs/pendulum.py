@@ -1,0 +1,28 @@
+"""Pendulum whose angular velocity only the simulator knows: cheap physics, for which a policy needs a memory."""
+
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_gac.envs.layout import TaskLayout, make_task
+
+LAYOUT = TaskLayout("Pendulum-v1", partial=(0, 1), velocity=(2,))
+
+
+def make_pendulum(noise_std: float = 0.0, privileged: str = "state", **kwargs: Any) -> gym.Env:
+    """
+    Build the task without its time limit, which ``gymnasium.make("sb3_gac/Pendulum-v1")`` adds.
+
+    ``partial`` is the angle's cosine and sine.
+
+    :param noise_std: standard deviation of the noise on ``partial``; 0 for none
+    :param privileged: "state" for the whole clean state, "velocity" for the angular velocity alone
+    :param kwargs: of the gymnasium environment
+    :raises ValueError: if ``privileged`` is unknown, or ``noise_std`` negative
+    """
+    return make_task(LAYOUT, noise_std, privileged, **kwargs)
+
+
+def register_pendulum() -> None:
+    """Register ``sb3_gac/Pendulum-v1``, with gymnasium's time limit of 200 steps."""
+    gym.register("sb3_gac/Pendulum-v1", entry_point="sb3_gac.envs.pendulum:make_pendulum", max_episode_steps=200)

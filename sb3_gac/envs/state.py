@@ -1,0 +1,155 @@
+"""
+What has to be written down of an environment in the middle of an episode, so that another process goes on from there.
+
+Known are MuJoCo's and two of classic control's environments, gymnasium's wrappers around registered ones, SB3's ``Monitor``
+and the wrappers of this package.  Any other environment or wrapper takes part by two methods::
+
+    def checkpoint_state(self) -> dict[str, Any]          # of numbers, strings, lists, dicts, arrays and generators
+    def restore_checkpoint_state(self, state) -> None
+"""
+
+from collections import deque
+from copy import deepcopy
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+#: Class -> the attributes that change from reset to reset and from step to step
+CHANGING: dict[str, tuple[str, ...]] = {
+    "gymnasium.wrappers.common.TimeLimit": ("_elapsed_steps",),
+    "gymnasium.wrappers.common.OrderEnforcing": ("_has_reset",),
+    "gymnasium.wrappers.common.PassiveEnvChecker": (),
+    "gymnasium.wrappers.common.RecordEpisodeStatistics": ("episode_count", "episode_returns", "episode_lengths"),
+    "gymnasium.wrappers.transform_action.ClipAction": (),
+    "gymnasium.wrappers.transform_action.RescaleAction": (),
+    "gymnasium.wrappers.transform_observation.FlattenObservation": (),
+    "gymnasium.envs.classic_control.pendulum.PendulumEnv": ("state", "last_u"),
+    "gymnasium.envs.classic_control.cartpole.CartPoleEnv": ("state", "steps_beyond_terminated"),
+    "stable_baselines3.common.monitor.Monitor": (
+        "rewards",
+        "needs_reset",
+        "episode_returns",
+        "episode_lengths",
+        "episode_times",
+        "total_steps",
+        "current_reset_info",
+    ),
+    "sb3_gac.envs.wrappers.SplitObservation": (),
+    "sb3_gac.envs.wrappers.SplitDictObservation": (),
+    "sb3_gac.envs.wrappers.SensorNoise": ("_generator", "_drawn", "_n_used"),
+    "sb3_gac.envs.wrappers.History": ("_values", "_actions"),
+    "sb3_gac.envs.wrappers.PreviousAction": (),
+    "sb3_gac.envs.actions.FlattenMultiDiscrete": (),
+}
+#: Set when a state is restored: the checker looks at an episode's first steps, which were before
+_CHECKED = ("checked_reset", "checked_step", "checked_data_reuse")
+_MUJOCO = "mujoco"  # where the layer's state has this entry, it is of MuJoCo's model and data
+
+
+class NotRestorableError(ValueError):
+    """An environment, or a wrapper around it, of which it is not known what its state is."""
+
+
+def layers(env: gym.Env) -> list[gym.Env]:
+    """
+    :param env: wrapped
+    :return: its wrappers from the outermost on, and last the environment itself
+    """
+    found = [env]
+    while isinstance(found[-1], gym.Wrapper):
+        found.append(found[-1].env)
+    return found
+
+
+def env_state(env: gym.Env) -> list[dict[str, Any]]:
+    """
+    :param env: wrapped, between two steps
+    :return: state of each of its :func:`layers`, copied
+    :raises NotRestorableError: naming the layer whose state is not known
+    """
+    return [{"class": _name(layer), **_layer_state(layer)} for layer in layers(env)]
+
+
+def restore_env_state(env: gym.Env, states: list[dict[str, Any]]) -> None:
+    """
+    :param env: wrapped in the same layers
+    :param states: of :func:`env_state`
+    :raises NotRestorableError: if the layers are others
+    """
+    names, expected = [_name(layer) for layer in layers(env)], [state["class"] for state in states]
+    if names != expected:
+        raise NotRestorableError(f"the environment is made of {names}, but the checkpoint's was made of {expected}")
+    for layer, state in zip(layers(env), states, strict=True):
+        _restore_layer(layer, {key: value for key, value in state.items() if key != "class"})
+
+
+def _name(layer: gym.Env) -> str:
+    return f"{type(layer).__module__}.{type(layer).__qualname__}"
+
+
+def _layer_state(layer: gym.Env) -> dict[str, Any]:
+    if hasattr(type(layer), "checkpoint_state"):
+        state = dict(layer.checkpoint_state())  # type: ignore[attr-defined]
+    elif _is_mujoco(layer):
+        state = {_MUJOCO: _mujoco_state(layer)}
+    elif _name(layer) in CHANGING:
+        state = {attribute: deepcopy(getattr(layer, attribute)) for attribute in CHANGING[_name(layer)]}
+    else:
+        raise NotRestorableError(
+            f"it is not known what the state of {_name(layer)} is: give it the methods checkpoint_state() and "
+            "restore_checkpoint_state(state)"
+        )
+    if not isinstance(layer, gym.Wrapper) and layer._np_random is not None:
+        state["np_random"] = deepcopy(layer._np_random)
+    return state
+
+
+def _restore_layer(layer: gym.Env, state: dict[str, Any]) -> None:
+    if "np_random" in state:
+        layer.np_random = state.pop("np_random")
+    if hasattr(type(layer), "restore_checkpoint_state"):
+        layer.restore_checkpoint_state(state)  # type: ignore[attr-defined]
+    elif _MUJOCO in state:
+        _restore_mujoco(layer, state[_MUJOCO])
+    else:
+        if isinstance(layer, gym.wrappers.PassiveEnvChecker):
+            vars(layer).update(dict.fromkeys(_CHECKED, True))
+        for attribute, value in state.items():
+            now = getattr(layer, attribute)
+            setattr(layer, attribute, deque(value, maxlen=now.maxlen) if isinstance(now, deque) else value)
+
+
+def _is_mujoco(layer: gym.Env) -> bool:
+    data = getattr(layer, "data", None) if not isinstance(layer, gym.Wrapper) else None
+    return type(data).__module__.startswith("mujoco") and type(data).__name__ == "MjData"
+
+
+def _mujoco_state(layer: Any) -> dict[str, Any]:
+    """
+    MuJoCo's own state, from which a step computes the next one, and all that it derived from the state before: observations
+    and rewards of some tasks read positions of bodies, which are those at the last step's start.
+    """
+    import mujoco
+
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(layer.model, spec))
+    mujoco.mj_getState(layer.model, layer.data, state, spec)
+    return {"state": state, "derived": {name: array.copy() for name, array in _derived(layer.data).items()}}
+
+
+def _restore_mujoco(layer: Any, saved: dict[str, Any]) -> None:
+    import mujoco
+
+    mujoco.mj_setState(layer.model, layer.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION)
+    mujoco.mj_forward(layer.model, layer.data)  # as many contacts, and arrays of their sizes, as there were
+    mujoco.mj_setState(layer.model, layer.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION)
+    for name, array in _derived(layer.data).items():
+        if name in saved["derived"] and saved["derived"][name].shape == array.shape:
+            array[...] = saved["derived"][name]
+
+
+def _derived(data: Any) -> dict[str, np.ndarray]:
+    names = [name for name in dir(data) if not name.startswith("_")]
+    arrays = {name: getattr(data, name) for name in names}
+    return {name: array for name, array in arrays.items() if isinstance(array, np.ndarray) and array.size}

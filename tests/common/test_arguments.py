@@ -1,0 +1,144 @@
+"""Every constructor argument out of its range gets a ValueError that names it, what is allowed and what it was."""
+
+import inspect
+
+import numpy as np
+import pytest
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_gac import GAC, AsymmetricSAC
+from tests.helpers import TwoViewBandit, small_model
+
+NAN, INF = float("nan"), float("inf")
+
+#: Argument -> (values out of its range, what the message says is allowed)
+SHARED = {
+    "policy": (["MlpPolicy", "CnnPolicy", "Multi", int, 3], "MultiInputPolicy"),
+    "env": ([3, TwoViewBandit, None], "environment"),
+    "learning_rate": (
+        [0, -1e-3, NAN, INF, "fast", None, lambda _: -1.0, lambda _: NAN, lambda left: left - 0.5],
+        r"learning_rate( at the (start|end) of training)? must be a number >",
+    ),
+    "buffer_size": ([0, -1, 1e6, "big", None], "buffer_size must be an integer >= 1"),
+    "learning_starts": ([-1, NAN, INF, "soon", None], "learning_starts must be a number >= 0"),
+    "batch_size": ([0, -1, 16.0, "big", None], "batch_size must be an integer >= 1"),
+    "tau": ([-0.1, 1.1, NAN, "slow", None], "tau must be a number from 0 to 1"),
+    "gamma": ([-0.1, 1.1, NAN, "far", None], "gamma must be a number from 0 to 1"),
+    "train_freq": (
+        [0, -1, 1.5, "4", None, (0, "step"), (1, "day"), (1,), (1, "step", 2), [1, "episode"]],
+        'train_freq must be an integer >= 1 or .integer >= 1, "step" or "episode".',
+    ),
+    "gradient_steps": ([-2, 0.5, "many", None], "gradient_steps must be an integer >= -1"),
+    "action_noise": ([0.1, "normal"], "action_noise must be an ActionNoise or None"),
+    "replay_buffer_class": ([ReplayBuffer, dict, "DictReplayBuffer"], "replay_buffer_class.*DictReplayBuffer"),
+    "replay_buffer_kwargs": ([3, ["storage_dtype"]], "replay_buffer_kwargs must be a dict or None"),
+    "optimize_memory_usage": (["yes", 2, None], r"optimize_memory_usage must be one of \[False, True\]"),
+    "n_steps": ([0, -1, 1.5, "three", None], "n_steps must be an integer >= 1"),
+    "ent_coef": (["automatic", "auto_zero", "auto_-1", "auto_0", -1, NAN, INF, None], 'ent_coef must be "auto"'),
+    "target_update_interval": ([0, -1, 0.5, None], "target_update_interval must be an integer >= 1"),
+    "target_entropy": (["high", NAN, -INF, None], 'target_entropy must be "auto", "sac" or a number'),
+    "max_grad_norm": ([0, -1, NAN, INF, "one"], "max_grad_norm must be a number > 0, or None"),
+    "lr_scales": (
+        [{"critic": 0}, {"critic": NAN}, {"nobody": 2.0}, 3.0, "critic"],
+        r'lr_scales(\["critic"\] must be a number > 0| names unknown roles \[.nobody.\]| must be a dict)',
+    ),
+    "role_keys": (
+        [{"student": ["partial"]}, {"critic": ["touch"]}, {"critic": []}, {"critic": "partial"}, 3, "partial"],
+        r'role_keys( names unknown roles|\["\w*critic"\] (names unknown.*touch|must be a non-empty list)| must be a dict)',
+    ),
+    "compile": (["yes", 2, None], r"compile must be one of \[False, True\]"),
+    "mixed_precision": (["bfloat16", 2, None], r"mixed_precision must be one of \[False, True\]"),
+    "stats_window_size": ([0, -1, 1.5, None], "stats_window_size must be an integer >= 1"),
+    "tensorboard_log": ([3, True], "tensorboard_log must be a directory or None"),
+    "policy_kwargs": (
+        [
+            3,
+            {"net_arch": {"nobody": [8]}},
+            {"net_arch": [0]},
+            {"net_arch": [8.5]},
+            {"net_arch": 8},
+            {"n_critics": 0},
+            {"rnn_hidden_size": 0},
+            {"log_std_bounds": (1, -1)},
+            {"log_std_bounds": 1},
+        ],
+        r"(policy_kwargs must be a dict|net_arch.* must be|n_critics must be|rnn_hidden_size must be|log_std_bounds must be)",
+    ),
+    "verbose": ([-1, 0.5, "loud", None], "verbose must be an integer >= 0"),
+    "seed": ([-1, 2**32, 0.5, "random"], "seed must be an integer from 0 to 4294967295, or None"),
+    "device": (["gpu", 3.5], 'device must be "auto", "cpu"'),
+}
+GACS_OWN = {
+    "target_kl": (
+        [0, -0.1, NAN, INF, "small", None, lambda _: NAN, lambda left: left - 0.5],
+        r"target_kl( at the (start|end) of training)? must be a number >",
+    ),
+    "kl_coef": (["automatic", "auto_", "auto_1000", -1, NAN, None], "kl_coef(=.*outside kl_coef_bounds| must be)"),
+    "kl_coef_bounds": (
+        [(1, 0.1), (0, 1), (1,), 3, (1, INF), None],
+        r"kl_coef_bounds must be a pair \(low, high\) with 0 < low",
+    ),
+    "kl_coef_learning_rate": ([0, -1, NAN, "fast", None], "kl_coef_learning_rate must be a number > 0"),
+    "kl_reduction": (["max", None, 3], r"kl_reduction must be one of \['mean', 'sum'\]"),
+    "guider": (["teacher", None, []], r"guider must be one of \['independent', 'residual'\]"),
+    "max_kl": ([0, -1, NAN, INF, "tight"], "max_kl must be a number > 0, or None"),
+    "learner_kl_scale": ([-1, NAN, INF, "full", None], 'learner_kl_scale must be a number >= 0, or "auto"'),
+    "learner_entropy": (["yes", 2, None], r"learner_entropy must be one of \[False, True\]"),
+}
+ARGUMENTS = {GAC: {**SHARED, **GACS_OWN}, AsymmetricSAC: SHARED}
+CASES = [
+    pytest.param(cls, name, value, message, id=f"{cls.__name__}-{name}-{value!r:.30}".replace("<function ", "<"))
+    for cls, arguments in ARGUMENTS.items()
+    for name, (values, message) in arguments.items()
+    for value in values
+]
+
+
+@pytest.mark.parametrize(("cls", "name", "value", "message"), CASES)
+def test_an_argument_out_of_its_range_is_named(cls, name, value, message):
+    arguments = {"policy": "MultiInputPolicy", "env": TwoViewBandit(), "buffer_size": 100, name: value}
+    with pytest.raises(ValueError, match=message):
+        cls(**arguments)
+
+
+@pytest.mark.parametrize("cls", ARGUMENTS)
+def test_no_argument_is_forgotten(cls):
+    parameters = set(inspect.signature(cls).parameters) - {"_init_setup_model"}  # SB3's, for load()
+    assert parameters == set(ARGUMENTS[cls])
+
+
+@pytest.mark.parametrize("cls", ARGUMENTS)
+def test_what_is_at_the_edge_of_its_range_is_taken_again_and_again(cls, tmp_path):
+    """The checks see their own results again when a model is loaded."""
+    arguments = {
+        "learning_rate": lambda left: 3e-4 * left,
+        "buffer_size": np.int64(50),
+        "learning_starts": 0,
+        "tau": 1,
+        "gamma": 0,
+        "train_freq": (2, "step"),
+        "gradient_steps": -1,
+        "max_grad_norm": None,
+        "seed": np.int64(0),
+        "verbose": False,
+        "tensorboard_log": None,
+    }
+    if cls is GAC:
+        arguments |= {"target_kl": lambda left: 0.01 * left, "learner_kl_scale": 0, "kl_coef": "auto_100"}
+    model = small_model(cls=cls, **arguments).learn(6)
+    model.save(tmp_path / "model")
+    loaded = cls.load(tmp_path / "model", env=model.get_env())
+    assert loaded.learn(6)._n_updates > 0
+
+
+def test_episodes_are_counted_in_one_environment_only():
+    with pytest.raises(ValueError, match=r"train_freq .*one environment only, got \(1, 'episode'\) for 2"):
+        small_model(DummyVecEnv([TwoViewBandit] * 2), train_freq=(1, "episode"))
+
+
+@pytest.mark.parametrize(("name", "value"), [("batch_size", 0), ("target_kl", -1.0), ("learning_rate", NAN)])
+def test_arguments_given_to_load_are_checked(name, value, tmp_path):
+    small_model().save(tmp_path / "model")
+    with pytest.raises(ValueError, match=name):
+        GAC.load(tmp_path / "model", **{name: value})

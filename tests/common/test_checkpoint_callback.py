@@ -1,0 +1,78 @@
+"""Checkpoints on a schedule and on signals."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from sb3_gac import GAC, ExactCheckpointCallback
+from sb3_gac.common.checkpoint_files import checkpoints
+from tests.helpers import TwoViewBandit, small_model
+
+
+def _steps(directory):
+    return [int(path.name.removeprefix("step-")) for path in checkpoints(directory)]
+
+
+def test_schedule(tmp_path):
+    model = small_model(TwoViewBandit(length=5))
+    model.learn(100, callback=ExactCheckpointCallback(tmp_path, every=30, keep=2, notes=lambda: model.num_timesteps))
+    assert _steps(tmp_path) == [90, 60]
+    resumed = GAC.resume(tmp_path, TwoViewBandit(length=5), device="cpu")
+    assert (resumed.resumed_notes, resumed.steps_left) == (90, 10)
+    resumed.learn(resumed.steps_left, reset_num_timesteps=False, callback=ExactCheckpointCallback(tmp_path, every=30))
+    assert (resumed.num_timesteps, _steps(tmp_path)) == (100, [90, 60])
+
+
+@pytest.mark.parametrize("argument", ["every", "keep"])
+def test_bad_arguments(argument, tmp_path):
+    with pytest.raises(ValueError, match=f"{argument} must be at least 1, got 0"):
+        ExactCheckpointCallback(tmp_path, **{"every": 10, argument: 0})
+
+
+def test_a_checkpoint_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch):
+    model = small_model(TwoViewBandit(length=5))
+    save = model.save_checkpoint
+
+    def failing(*args, **kwargs):
+        if model.num_timesteps > 30:
+            raise OSError(28, "No space left on device")
+        return save(*args, **kwargs)
+
+    monkeypatch.setattr(model, "save_checkpoint", failing)
+    with pytest.warns(UserWarning, match=r"after 60 steps could not be written to .*No space left.* Training goes on"):
+        model.learn(100, callback=ExactCheckpointCallback(tmp_path, every=30))
+    assert (model.num_timesteps, _steps(tmp_path)) == (100, [30])
+
+
+SCRIPT = """
+import sys
+from sb3_gac import ExactCheckpointCallback
+from tests.helpers import TwoViewBandit, small_model
+class Signalling(TwoViewBandit):
+    def step(self, action):
+        if model.num_timesteps == 40:
+            import os
+            os.kill(os.getpid(), int(sys.argv[2]))
+        return super().step(action)
+model = small_model(Signalling(length=5))
+model.learn(10**6, callback=ExactCheckpointCallback(sys.argv[1], every=10**6))
+"""
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, -signal.SIGINT)])
+def test_signals_finish_the_step_and_end_the_process(number, status, tmp_path):
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path), str(int(number))]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == status, result.stderr
+    name = signal.Signals(number).name
+    assert f"Stopped by {name}; the checkpoint after 41 steps is in {tmp_path}" in result.stderr
+    assert 'GAC.resume("' in result.stderr
+    assert _steps(tmp_path) == [41]
+
+
+def test_handlers_are_put_back(tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    small_model().learn(20, callback=ExactCheckpointCallback(tmp_path, every=100))
+    assert signal.getsignal(signal.SIGTERM) is before
