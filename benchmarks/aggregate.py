@@ -264,7 +264,10 @@ def main() -> None:
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
     options = parser.parse_args()
     specs, missing = finished_runs(options.suite, options.runs, options.complete_cells)
-    tidy = collect(specs, options.runs)
+    evaluations = options.out.with_suffix(".csv")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    collect(specs, options.runs).to_csv(evaluations, index=False, float_format="%.6g")
+    tidy = pd.read_csv(evaluations, dtype={"noise": float})  # so that the scores follow from the file to the last digit
     reference = choose_reference(list(tidy.algorithm.unique()), options.reference)
     results = {
         **origins(options.suite, specs, options.runs),
@@ -273,8 +276,6 @@ def main() -> None:
         "cells": summarise_cells(tidy, reference),
         **compare(tidy),
     }
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    tidy.round(5).to_csv(options.out.with_suffix(".csv"), index=False)
     options.out.with_suffix(".json").write_text(json.dumps(results, indent=1, allow_nan=False))
 
 
