@@ -4,7 +4,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import benchmarks.aggregate
 from benchmarks.aggregate import choose_reference, compare, summarise_cells
+
+
+@pytest.fixture(autouse=True)
+def _few_resamples(monkeypatch):
+    monkeypatch.setattr(benchmarks.aggregate, "BOOTSTRAPS", 200)
 
 
 def _evaluations(algorithm, seed, learner, task="T", guider=None):
