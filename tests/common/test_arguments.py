@@ -88,7 +88,9 @@ GACS_OWN = {
 }
 ARGUMENTS = {GAC: {**SHARED, **GACS_OWN}, AsymmetricSAC: SHARED}
 CASES = [
-    pytest.param(cls, name, value, message, id=f"{cls.__name__}-{name}-{value!r:.30}".replace("<function ", "<"))
+    pytest.param(
+        cls, name, value, message, id=f"{cls.__name__}-{name}-{'a function' if callable(value) else repr(value)[:30]}"
+    )
     for cls, arguments in ARGUMENTS.items()
     for name, (values, message) in arguments.items()
     for value in values
