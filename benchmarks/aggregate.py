@@ -207,14 +207,17 @@ def _compared_cells(compared: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _estimate(scores: dict[str, Any], metric: Callable[..., float]) -> dict[str, tuple[float, tuple[float, float]]]:
-    """Point estimate and interval of a metric, the same for the same scores."""
+    """Point estimate and interval, the same for the same scores: rliable draws from numpy's global generator."""
     if not scores:
         return {}
 
     def as_array(*arguments: np.ndarray) -> np.ndarray:
         return np.array([metric(*arguments)])
 
-    points, intervals = rly.get_interval_estimates(scores, as_array, reps=BOOTSTRAPS, random_state=np.random.RandomState(0))
+    state = np.random.get_state()
+    np.random.seed(0)
+    points, intervals = rly.get_interval_estimates(scores, as_array, reps=BOOTSTRAPS)
+    np.random.set_state(state)
     return {name: (float(points[name][0]), (float(intervals[name][0, 0]), float(intervals[name][1, 0]))) for name in scores}
 
 
