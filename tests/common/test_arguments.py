@@ -17,7 +17,7 @@ SHARED = {
     "policy": (["MlpPolicy", "CnnPolicy", "Multi", int, 3], "MultiInputPolicy"),
     "env": ([3, TwoViewBandit, None], "environment"),
     "learning_rate": (
-        [0, -1e-3, NAN, INF, "fast", None, lambda _: -1.0, lambda _: NAN, lambda left: left - 0.5],
+        [-1e-3, NAN, INF, "fast", None, lambda _: -1.0, lambda _: NAN, lambda left: left - 0.5],
         r"learning_rate( at the (start|end) of training)? must be a number >",
     ),
     "buffer_size": ([0, -1, 1e6, "big", None], "buffer_size must be an integer >= 1"),
