@@ -46,7 +46,7 @@ def check_shared_arguments(model: OffPolicyAlgorithm) -> None:
     :raises ValueError: naming the argument, what is allowed and what it was
     """
     values = vars(model)
-    check_schedule("learning_rate", model.learning_rate)
+    check_schedule("learning_rate", model.learning_rate, may_be_zero=True)  # so rl_zoo3 loads models to play with
     check_integer("buffer_size", model.buffer_size, 1)
     check_not_negative("learning_starts", model.learning_starts)
     check_integer("batch_size", model.batch_size, 1)

@@ -88,12 +88,12 @@ def check_type(name: str, value: Any, types: type | tuple[type, ...], expected: 
         raise ValueError(f"{name} must be {expected}, got {value!r}.")
 
 
-def check_schedule(name: str, value: Any, remedy: str = "or a schedule") -> None:
+def check_schedule(name: str, value: Any, remedy: str = "or a schedule", may_be_zero: bool = False) -> None:
     """
-    :raises ValueError: unless ``value`` is a number > 0, or a schedule, which may begin or end at zero
+    :raises ValueError: unless ``value`` is a number > 0, or >= 0, or a schedule, which may begin or end at zero
     """
     if not callable(value):
-        check_positive(name, value, remedy)
+        (check_not_negative if may_be_zero else check_positive)(name, value, remedy)
         return
     for progress_remaining, when in ((1.0, "start"), (0.0, "end")):
         check_not_negative(f"{name} at the {when} of training", value(progress_remaining))

@@ -4,7 +4,7 @@ import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -16,7 +16,6 @@ KEPT = "Nothing of this step was stored, and all that was learned before is kept
 GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
 GUARD = "_environment_guard"
 RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under "terminal_observation"
-REWARD = spaces.Box(-np.inf, np.inf, (), np.float32)
 PATIENCE = 2.0  # seconds that a process whose pipe has closed has to end
 
 
@@ -55,8 +54,8 @@ class EnvironmentGuard:
 
     def __init__(self, env: VecEnv):
         self.env, self.base = env, env.unwrapped
-        self._spaces = _entry_spaces(env.observation_space)
-        self._base_spaces = _entry_spaces(self.base.observation_space)
+        self._entries = _entries_in(env.observation_space)
+        self._base_entries = _entries_in(self.base.observation_space)
         self._failure: str | None = None
         self._reset, self._step_async, self._step_wait = env.reset, env.step_async, env.step_wait
         vars(env).update(reset=self.reset, step_async=self.step_async, step_wait=self.step_wait)
@@ -104,7 +103,7 @@ class EnvironmentGuard:
         for index in np.flatnonzero(dones).tolist():
             final = infos[index].get("terminal_observation")
             if final is not None:
-                _check_entries(final, self._spaces, index, "The last observation's entry")
+                _check_entries(final, self._entries, index, "The last observation's entry")
                 infos[index][RAW_FINAL] = final
         return observation, rewards, dones, infos
 
@@ -117,10 +116,10 @@ class EnvironmentGuard:
         :raises InvalidStepError: if it does not fit its space or is not finite
         """
         entries = entries_of(observation)
-        for key, space in self._base_spaces.items():
+        for key, entry in self._base_entries.items():
             value = entries.get(key)
-            if not (isinstance(value, np.ndarray) and value.shape == space.shape and value.dtype == space.dtype):
-                _check_entries(entries, {key: space}, index)
+            if not (isinstance(value, np.ndarray) and value.shape == entry.shape and value.dtype == entry.dtype):
+                _check_entries(entries, {key: entry}, index)
         self._save_obs(index, observation)
 
     # --- checks -------------------------------------------------------------------------------------------------------
@@ -128,8 +127,8 @@ class EnvironmentGuard:
     def _check_observation(self, observation: Any) -> None:
         """One look at each entry of all environments together."""
         entries = entries_of(observation)
-        for key, space in self._spaces.items():
-            _check_rows(f'The observation\'s entry "{key}"', entries[key], space)
+        for key, entry in self._entries.items():
+            _check_rows(f'The observation\'s entry "{key}"', entries[key], entry)
 
     # --- failures -----------------------------------------------------------------------------------------------------
 
@@ -160,7 +159,7 @@ class EnvironmentGuard:
             if frame.f_code.co_name == "_stack_obs":
                 for number, observation in enumerate(frame.f_locals["obs_list"]):
                     try:
-                        _check_entries(observation, self._base_spaces, number)
+                        _check_entries(observation, self._base_entries, number)
                     except InvalidStepError as fault:
                         return fault
         return None
@@ -192,49 +191,73 @@ class WatchedPipe:
         return self._pipe.recv()
 
 
-def _entry_spaces(space: spaces.Space) -> dict[str, spaces.Space]:
+class Entry(NamedTuple):
+    """
+    What is to be known of an entry in every step.
+
+    :param space: of one environment's
+    :param shape: of that space
+    :param dtype: of that space
+    :param bounds: see :func:`index_bounds`
+    """
+
+    space: spaces.Space
+    shape: tuple[int, ...] | None
+    dtype: Any
+    bounds: tuple[Any, Any] | None
+
+    @classmethod
+    def of(cls, space: spaces.Space) -> "Entry":
+        """
+        :param space: of one environment's
+        """
+        return cls(space, space.shape, space.dtype, index_bounds(space))
+
+
+REWARD = Entry.of(spaces.Box(-np.inf, np.inf, (), np.float32))
+
+
+def _entries_in(space: spaces.Space) -> dict[str, Entry]:
     """Those of an observation's entries that are single arrays."""
     entries = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-    return {key: entry for key, entry in entries.items() if entry.shape is not None}
+    return {key: Entry.of(entry) for key, entry in entries.items() if entry.shape is not None}
 
 
-def _check_entries(
-    observation: Any, entry_spaces: dict[str, spaces.Space], index: int, what: str = "The observation's entry"
-) -> None:
+def _check_entries(observation: Any, expected: dict[str, Entry], index: int, what: str = "The observation's entry") -> None:
     """
     :param observation: of one environment
-    :param entry_spaces: of its entries
+    :param expected: its entries
     :param index: of the environment
     :param what: the entries' kind, for the message
     :raises InvalidStepError: naming the entry and the environment
     """
     entries = entries_of(observation)
-    for key, space in entry_spaces.items():
-        fault = fault_of(entries[key], space) if key in entries else "is missing"
+    for key, entry in expected.items():
+        fault = fault_of(entries[key], entry.space) if key in entries else "is missing"
         if fault is not None:
             raise InvalidStepError(_message(f'{what} "{key}"', index, fault))
 
 
-def _check_rows(name: str, rows: Any, space: spaces.Space) -> None:
+def _check_rows(name: str, rows: Any, entry: Entry) -> None:
     """
     One look at all environments together; at each by itself only if something may be wrong.
 
     :param name: for the message
     :param rows: one for each environment
-    :param space: of a row
+    :param entry: what each is to be
     :raises InvalidStepError: naming the environment
     """
-    bounds = index_bounds(space)
+    bounds = entry.bounds
     if (
         isinstance(rows, np.ndarray)
-        and rows.shape[1:] == space.shape
-        and _comes_in(rows.dtype, space.dtype)
-        and is_finite(rows, space.dtype)
+        and rows.shape[1:] == entry.shape
+        and _comes_in(rows.dtype, entry.dtype)
+        and is_finite(rows, entry.dtype)
         and (bounds is None or ((rows >= bounds[0]) & (rows <= bounds[1])).all())
     ):
         return
     for index, row in enumerate(rows):
-        fault = fault_of(row, space)
+        fault = fault_of(row, entry.space)
         if fault is not None:
             raise InvalidStepError(_message(name, index, fault))
 

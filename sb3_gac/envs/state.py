@@ -18,6 +18,7 @@ import numpy as np
 #: Class -> the attributes that change from reset to reset and from step to step
 CHANGING: dict[str, tuple[str, ...]] = {
     "gymnasium.wrappers.common.TimeLimit": ("_elapsed_steps",),
+    "rl_zoo3.gym_patches.PatchedTimeLimit": ("_elapsed_steps",),  # in its place, once rl_zoo3 is imported
     "gymnasium.wrappers.common.OrderEnforcing": ("_has_reset",),
     "gymnasium.wrappers.common.PassiveEnvChecker": (),
     "gymnasium.wrappers.common.RecordEpisodeStatistics": ("episode_count", "episode_returns", "episode_lengths"),

@@ -17,7 +17,7 @@ SHARED = {
     "policy": (["MlpPolicy", "CnnPolicy", "Multi", int, 3], "MultiInputPolicy"),
     "env": ([3, TwoViewBandit, None], "environment"),
     "learning_rate": (
-        [0, -1e-3, NAN, INF, "fast", None, lambda _: -1.0, lambda _: NAN, lambda left: left - 0.5],
+        [-1e-3, NAN, INF, "fast", None, lambda _: -1.0, lambda _: NAN, lambda left: left - 0.5],
         r"learning_rate( at the (start|end) of training)? must be a number >",
     ),
     "buffer_size": ([0, -1, 1e6, "big", None], "buffer_size must be an integer >= 1"),
@@ -88,7 +88,9 @@ GACS_OWN = {
 }
 ARGUMENTS = {GAC: {**SHARED, **GACS_OWN}, AsymmetricSAC: SHARED}
 CASES = [
-    pytest.param(cls, name, value, message, id=f"{cls.__name__}-{name}-{value!r:.30}".replace("<function ", "<"))
+    pytest.param(
+        cls, name, value, message, id=f"{cls.__name__}-{name}-{'a function' if callable(value) else repr(value)[:30]}"
+    )
     for cls, arguments in ARGUMENTS.items()
     for name, (values, message) in arguments.items()
     for value in values

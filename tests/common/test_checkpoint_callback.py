@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from sb3_gac import GAC, ExactCheckpointCallback
+from sb3_gac import GAC, DivergenceError, ExactCheckpointCallback
 from sb3_gac.common.checkpoint_files import checkpoints
 from tests.helpers import TwoViewBandit, small_model
 
@@ -76,3 +76,21 @@ def test_handlers_are_put_back(tmp_path):
     before = signal.getsignal(signal.SIGTERM)
     small_model().learn(20, callback=ExactCheckpointCallback(tmp_path, every=100))
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+class _Exploding(TwoViewBandit):
+    """Rewards whose squares are not finite, from step 41 on."""
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        self.steps = getattr(self, "steps", 0) + 1
+        return observation, 1e30 if self.steps > 40 else reward, *rest
+
+
+def test_diverged_training_leaves_the_last_good_checkpoint(tmp_path):
+    model = small_model(_Exploding(length=5), batch_size=64)
+    with pytest.raises(DivergenceError):
+        model.learn(100, callback=ExactCheckpointCallback(tmp_path, every=10, keep=2))
+    assert max(_steps(tmp_path)) == 40
+    resumed = GAC.resume(tmp_path, TwoViewBandit(length=5), device="cpu")
+    assert all(bool(value.isfinite().all()) for value in resumed.get_parameters()["policy"].values())

@@ -60,7 +60,10 @@ class Mine:
     pass
 
 
-@pytest.mark.parametrize("value", [Mine, Mine(), lambda x: x, {1: 2}, np.array([None])], ids=["class", "object", "function", "keys", "array"])
+OTHERS = {"class": Mine, "object": Mine(), "function": lambda x: x, "keys": {1: 2}, "array": np.array([None])}
+
+
+@pytest.mark.parametrize("value", OTHERS.values(), ids=OTHERS)
 def test_what_is_of_other_libraries_is_named(value):
     with pytest.raises((UntrustedNameError, TypeError)):
         encode(value, {})
