@@ -64,6 +64,7 @@ class ExactCheckpointCallback(BaseCallback):
         self._caught = None
         if self.on_signals and threading.current_thread() is threading.main_thread():
             self._handlers = {number: signal.signal(number, self._catch) for number in _SIGNALS}
+            self.model.learn_scope.callback(self._release_signals)  # after an error as well
 
     def _catch(self, number: int, frame: FrameType | None) -> None:
         self._caught = number
@@ -88,7 +89,6 @@ class ExactCheckpointCallback(BaseCallback):
         return True
 
     def _end_process(self, number: int) -> None:
-        self._release_signals()
         saved = f"after {self.model.num_timesteps} steps" if self._save() else "before the last one failed"
         message = (
             f"Stopped by {signal.Signals(number).name}; the checkpoint {saved} is in {self.directory}. To go on: model = "
@@ -102,9 +102,6 @@ class ExactCheckpointCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
-
-    def _on_training_end(self) -> None:
-        self._release_signals()
 
     def _release_signals(self) -> None:
         for number, handler in self._handlers.items():

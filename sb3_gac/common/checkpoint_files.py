@@ -3,11 +3,13 @@ Checkpoints on disk: each a directory that is there whole or not at all, every f
 
 ::
 
-    <root>/step-000000050000/manifest.json   names, sizes and checksums of all that belongs to it
-    <root>/step-000000050000/...             what changes from one checkpoint to the next
-    <root>/blocks/<checksum>                 what they share: parts of the replay buffer that have not changed
+    <root>/checkpoint-000007-step-000000050000/manifest.json   names, sizes and checksums of all that belongs to it
+    <root>/checkpoint-000007-step-000000050000/...             what changes from one checkpoint to the next
+    <root>/blocks/<checksum>                                   what they share: parts of the replay buffer
 
-A block is written once, whatever number of checkpoints it belongs to, and goes with the last of them.
+The latest one is the one that was written last, whatever its step: training may have been resumed from before a checkpoint
+that turned out to be damaged.  A block is written once, whatever number of checkpoints it belongs to, and goes with the last
+of them.
 """
 
 import hashlib
@@ -20,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 FORMAT = 1
-_PREFIX, _TEMPORARY, _BLOCKS, _MANIFEST = "step-", ".writing-", "blocks", "manifest.json"
+_PREFIX, _TEMPORARY, _BLOCKS, _MANIFEST = "checkpoint-", ".writing", "blocks", "manifest.json"
 
 
 class CheckpointError(ValueError):
@@ -64,10 +66,18 @@ def write_block(root: Path, content: bytes) -> str:
     path = root / _BLOCKS / name
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{_TEMPORARY}{name}")
+        temporary = path.with_name(_TEMPORARY)
         write_durably(temporary, content)
         temporary.replace(path)
     return name
+
+
+def has_block(root: Path, name: str) -> bool:
+    """
+    :param root: of the checkpoints
+    :param name: of :func:`write_block`
+    """
+    return (root / _BLOCKS / name).exists()
 
 
 def read_block(root: Path, name: str) -> bytes:
@@ -89,7 +99,9 @@ def write_checkpoint(root: Path, step: int, files: Mapping[str, bytes], blocks: 
     :raises OSError: if the disk is full; what was there before is as it was
     """
     root.mkdir(parents=True, exist_ok=True)
-    final, temporary = root / f"{_PREFIX}{step:012d}", root / f"{_TEMPORARY}{step:012d}"
+    earlier = checkpoints(root)
+    number = int(earlier[0].name.split("-")[1]) + 1 if earlier else 1
+    final, temporary = root / f"{_PREFIX}{number:06d}-step-{step:012d}", root / _TEMPORARY
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir()
@@ -104,7 +116,6 @@ def write_checkpoint(root: Path, step: int, files: Mapping[str, bytes], blocks: 
     except OSError:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    shutil.rmtree(final, ignore_errors=True)  # of an earlier run that was resumed from before this step
     temporary.rename(final)
     sync_directory(root)
     _prune(root, keep)
@@ -114,9 +125,17 @@ def write_checkpoint(root: Path, step: int, files: Mapping[str, bytes], blocks: 
 def checkpoints(root: Path) -> list[Path]:
     """
     :param root: of the checkpoints
-    :return: their directories, the latest first
+    :return: their directories, the one written last first
     """
     return sorted(root.glob(f"{_PREFIX}*"), reverse=True)
+
+
+def step_of(checkpoint: Path) -> int:
+    """
+    :param checkpoint: one of :func:`checkpoints`
+    :return: number of environment steps
+    """
+    return int(checkpoint.name.rpartition("-")[2])
 
 
 def _prune(root: Path, keep: int) -> None:

@@ -6,6 +6,7 @@ import json
 import random
 import warnings
 from collections.abc import Mapping
+from contextlib import ExitStack
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,8 +19,16 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFr
 from typing_extensions import Self
 
 from sb3_gac.common.buffers import CompactDictReplayBuffer
-from sb3_gac.common.checkpoint_files import CheckpointError, latest_whole, read_block, write_block, write_checkpoint
-from sb3_gac.common.serialization import UntrustedNameError, decode, encode, reference
+from sb3_gac.common.checkpoint_files import (
+    CheckpointError,
+    checksum,
+    has_block,
+    latest_whole,
+    read_block,
+    write_block,
+    write_checkpoint,
+)
+from sb3_gac.common.serialization import UntrustedNameError, decode, encode
 from sb3_gac.common.training import NetworkTraining
 from sb3_gac.common.vec_state import restore_vec_env_state, vec_env_state
 
@@ -38,6 +47,8 @@ PROGRESS = (
     "_behaviour_state",
     "ep_info_buffer",
     "ep_success_buffer",
+    "strict_deployment",
+    "trained_normalised",
 )
 _KEPT_AS = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}  # argument -> SB3's attribute
 _STATE, _ARRAYS, _TENSORS = "state.json", "arrays.npz", "tensors.pt"
@@ -68,6 +79,9 @@ class ResumableAlgorithm(NetworkTraining):
     _resumed_noise: Any = None
     #: What :meth:`save_checkpoint` was given to keep, after :meth:`resume`
     resumed_notes: Any = None
+
+    #: What is to be called when ``learn`` ends, in whatever way
+    learn_scope: ExitStack
 
     @property
     def steps_left(self) -> int:
@@ -100,7 +114,7 @@ class ResumableAlgorithm(NetworkTraining):
         saved = self._write_rows(buffer, root)
         arrays: dict[str, np.ndarray] = {}
         state = {
-            "algorithm": reference(type(self)),
+            "algorithm": _qualified_name(type(self)),
             "arguments": self._encoded_arguments(arrays),
             "spaces": _describe_spaces(self.observation_space, self.action_space),
             "n_envs": self.n_envs,
@@ -130,8 +144,9 @@ class ResumableAlgorithm(NetworkTraining):
         if before is not None and before.root == root and buffer.n_added - before.n_added < n_rows - 2:
             names[: len(before.names)] = before.names
             # The step before may have been cut, and the newest next observation stands where a step to come will be
-            changed = np.unique(np.arange(max(before.n_added - 1, 0), buffer.n_added + 1) % n_rows // per_block)
-        for block in changed.tolist():
+            written = np.arange(max(before.n_added - 1, 0), buffer.n_added + 1) % n_rows // per_block
+            changed = np.union1d(written, [block for block, name in enumerate(names) if not has_block(root, name)])
+        for block in changed.astype(int).tolist():
             rows = slice(block * per_block, min((block + 1) * per_block, n_filled))
             names[block] = write_block(root, b"".join(array[rows].tobytes() for array in arrays.values()))
         return SavedBlocks(root, buffer.n_added, names)
@@ -189,7 +204,7 @@ class ResumableAlgorithm(NetworkTraining):
         root = Path(directory).absolute()
         path, files = latest_whole(root)
         state = json.loads(files[_STATE])
-        if state["algorithm"] != reference(cls):
+        if state["algorithm"] != _qualified_name(cls):
             raise CheckpointError(f"{path} is of {state['algorithm']}: resume it with that class, not {cls.__name__}.")
         with np.load(io.BytesIO(files[_ARRAYS]), allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
@@ -256,6 +271,11 @@ class ResumableAlgorithm(NetworkTraining):
         random.setstate(states["python"])
         self.action_space._np_random = states["action_space"]
 
+    def learn(self, *args: Any, **kwargs: Any) -> Self:
+        """See SB3's ``learn``."""
+        with ExitStack() as self.learn_scope:
+            return super().learn(*args, **kwargs)
+
     def _setup_learn(
         self,
         total_timesteps: int,
@@ -274,7 +294,11 @@ class ResumableAlgorithm(NetworkTraining):
         return result
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_saved_blocks", "_resumed_noise", "resumed_notes"]
+        return [*super()._excluded_save_params(), "_saved_blocks", "_resumed_noise", "resumed_notes", "learn_scope"]
+
+
+def _qualified_name(algorithm: type) -> str:
+    return f"{algorithm.__module__}.{algorithm.__qualname__}"
 
 
 def _rows_per_block(arrays: Mapping[str, np.ndarray]) -> int:
@@ -309,5 +333,6 @@ def _describe_spaces(observation_space: spaces.Space, action_space: spaces.Space
 def _describe(space: spaces.Space) -> str:
     if not isinstance(space, spaces.Box):
         return str(space)
-    bounds = f"[{np.array2string(space.low, threshold=8)}, {np.array2string(space.high, threshold=8)}]"
-    return f"Box of shape {space.shape}, {space.dtype}, within {bounds}".replace("\n", " ")
+    low, high = (np.array2string(bound, threshold=8) for bound in (space.low, space.high))
+    all_bounds = checksum(space.low.tobytes() + space.high.tobytes())[:8]  # a long array is shown by its ends
+    return f"Box of shape {space.shape}, {space.dtype}, within [{low}, {high}] ({all_bounds})".replace("\n", " ")

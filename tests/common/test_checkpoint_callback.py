@@ -5,14 +5,15 @@ import subprocess
 import sys
 
 import pytest
+from stable_baselines3.common.callbacks import ConvertCallback
 
 from sb3_gac import GAC, DivergenceError, ExactCheckpointCallback
-from sb3_gac.common.checkpoint_files import checkpoints
+from sb3_gac.common.checkpoint_files import checkpoints, step_of
 from tests.helpers import TwoViewBandit, small_model
 
 
 def _steps(directory):
-    return [int(path.name.removeprefix("step-")) for path in checkpoints(directory)]
+    return [step_of(path) for path in checkpoints(directory)]
 
 
 def test_schedule(tmp_path):
@@ -74,7 +75,17 @@ def test_signals_finish_the_step_and_end_the_process(number, status, tmp_path):
 
 def test_handlers_are_put_back(tmp_path):
     before = signal.getsignal(signal.SIGTERM)
-    small_model().learn(20, callback=ExactCheckpointCallback(tmp_path, every=100))
+    seen = []
+    watch = ConvertCallback(lambda scope, _: seen.append(signal.getsignal(signal.SIGTERM)) or True)
+    small_model().learn(20, callback=[ExactCheckpointCallback(tmp_path, every=100), watch])
+    assert before not in seen
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_handlers_are_put_back_after_an_error(tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(DivergenceError):
+        small_model(_Exploding(length=5), batch_size=64).learn(100, callback=ExactCheckpointCallback(tmp_path, every=100))
     assert signal.getsignal(signal.SIGTERM) is before
 
 

@@ -15,6 +15,7 @@ from sb3_gac.common.checkpoint_files import (
     latest_whole,
     read_block,
     read_checkpoint,
+    step_of,
     write_block,
     write_checkpoint,
 )
@@ -35,8 +36,17 @@ def test_what_was_written_is_read(tmp_path):
 def test_the_last_ones_are_kept_with_their_blocks(tmp_path):
     for step, block in [(10, b"a"), (20, b"b"), (1_000_000, b"b"), (2_000_000, b"c")]:
         _write(tmp_path, step, block=block)
-    assert [int(path.name.removeprefix("step-")) for path in checkpoints(tmp_path)] == [2_000_000, 1_000_000]
+    assert [step_of(path) for path in checkpoints(tmp_path)] == [2_000_000, 1_000_000]
     assert sorted(path.read_bytes() for path in (tmp_path / "blocks").iterdir()) == [b"b", b"c"]
+
+
+def test_what_was_written_last_stays_though_a_damaged_one_has_more_steps(tmp_path):
+    """Resumed from before a damaged checkpoint, the next one must not be taken for an old one and thrown away."""
+    _write(tmp_path, 10, text=b"before")
+    _truncate(_write(tmp_path, 200) / "state")
+    after = _write(tmp_path, 50, text=b"after", keep=1)
+    assert checkpoints(tmp_path) == [after]
+    assert latest_whole(tmp_path)[1]["state"] == b"after"
 
 
 def test_a_block_is_written_once(tmp_path):
@@ -127,6 +137,6 @@ def test_killed_at_any_moment_the_last_finished_one_is_there(delay, tmp_path):
         process.send_signal(signal.SIGKILL)
         finished = [1, *(int(line) for line in process.stdout)]
     path, files = latest_whole(tmp_path)
-    step = int(path.name.removeprefix("step-"))
+    step = step_of(path)
     assert step in (finished[-1], finished[-1] + 1)
     assert files["state"] == str(step).encode() * 2_000

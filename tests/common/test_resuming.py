@@ -1,5 +1,6 @@
 """Training 2 N steps is N, a checkpoint, another process, and N: to the bit."""
 
+import shutil
 import subprocess
 import sys
 
@@ -216,9 +217,52 @@ def test_another_environment_is_refused(env, message, tmp_path):
         GAC.resume(tmp_path, env(), device="cpu")
 
 
+class Wide(TwoViewBandit):
+    """Bounds that differ in the middle of a long entry only."""
+
+    def __init__(self, middle):
+        super().__init__()
+        low = np.zeros(40, dtype=np.float32)
+        low[20] = middle
+        entries = {**self.observation_space.spaces, "extra": spaces.Box(low, np.ones(40, dtype=np.float32))}
+        self.observation_space = spaces.Dict(entries)
+
+    def _draw(self):
+        return super()._draw() | {"extra": np.full(40, 0.5, dtype=np.float32)}
+
+
+def test_a_bound_in_the_middle_of_a_long_entry_counts(tmp_path):
+    small_model(Wide(-1.0)).learn(20).save_checkpoint(tmp_path)
+    with pytest.raises(ValueError, match="differs from the checkpoint's in the observation's entry \"extra\""):
+        GAC.resume(tmp_path, Wide(-2.0), device="cpu")
+
+
+class OwnGAC(GAC):
+    """A subclass of a user's."""
+
+
+def test_a_subclass_of_ones_own_goes_on(tmp_path):
+    model = small_model(cls=OwnGAC).learn(20)
+    model.strict_deployment = True
+    model.save_checkpoint(tmp_path)
+    resumed = OwnGAC.resume(tmp_path, TwoViewBandit(), device="cpu")
+    _assert_same(model, resumed)
+    assert resumed.strict_deployment
+    with pytest.raises(CheckpointError, match="OwnGAC: resume it with that class, not GAC"):
+        GAC.resume(tmp_path, TwoViewBandit(), device="cpu")
+
+
+def test_blocks_that_somebody_removed_are_written_again(tmp_path):
+    model = small_model(_bandits()).learn(40)
+    model.save_checkpoint(tmp_path)
+    shutil.rmtree(tmp_path)
+    model.save_checkpoint(tmp_path)
+    _assert_same(model, GAC.resume(tmp_path, _bandits(), device="cpu"))
+
+
 def test_another_algorithm_is_refused(tmp_path):
     small_model().learn(20).save_checkpoint(tmp_path)
-    with pytest.raises(CheckpointError, match=r"is of sb3_gac.gac.gac:GAC: resume it with that class, not AsymmetricSAC"):
+    with pytest.raises(CheckpointError, match=r"is of sb3_gac.gac.gac.GAC: resume it with that class, not AsymmetricSAC"):
         AsymmetricSAC.resume(tmp_path, TwoViewBandit())
 
 
