@@ -1,6 +1,6 @@
 """Soft Actor-Critic whose critics see more than its actor: SAC-asym, and with other keys SAC on either view."""
 
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -17,10 +17,7 @@ from sb3_gac.common.losses import learner_loss, learner_target, masked_mean
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
 from sb3_gac.common.roles import Roles
-from sb3_gac.common.training import Batch, Descent, Metrics
-
-#: The actor's distributions on the observations and on the next ones, see :meth:`Batch.outputs`; ``None`` to compute them
-Outputs: TypeAlias = tuple[Any, Any] | None
+from sb3_gac.common.training import Batch, Descent, Metrics, Slope, as_leaves, gradient_of
 
 
 class AsymmetricSACPolicy(AsymmetricPolicy):
@@ -105,35 +102,31 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         """SAC's critics are eq. 15's with the entropy term, its actor eq. 16's without a guider."""
         ent_coef = self.ent_coef_dual.value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
-        # Compiled code can differentiate only what it computes itself
-        outputs = None if self.compile else batch.outputs(self.policy.actor)
-        metrics = self._step("critic", self._fit(batch, outputs, noise[0], ent_coef))
-        descent, log_prob, actor = self._climb(batch, outputs, noise[1], ent_coef)
-        metrics |= self._step("actor", descent)
+        (now, later), backward = self._policy_pass("actor", batch)
+        metrics = self._step("critic", self._fit(batch, later, noise[0], ent_coef))
+        slope, log_prob = self._actor_slope(batch, now, noise[1], ent_coef)
+        metrics |= self._policy_step("actor", backward, slope)
         metrics |= self.ent_coef_dual.update(log_prob + float(self.target_entropy), batch.mask)
         if diagnose:
             metrics["ent_coef"] = self.ent_coef_dual.value
             metrics["entropy"] = -masked_mean(log_prob, batch.mask)
-            diagnostics = actor.diagnostics()
+            diagnostics = now.diagnostics()
             metrics |= {f"actor_{name}": masked_mean(values, batch.mask) for name, values in diagnostics.items()}
         return metrics
 
     @compilable
-    def _fit(self, batch: Batch, outputs: Outputs, noise: th.Tensor, ent_coef: th.Tensor) -> Descent:
-        return self._critic_descent("critic", batch, self._target(batch, outputs, noise, ent_coef))
+    def _fit(self, batch: Batch, later: Distribution, noise: th.Tensor, ent_coef: th.Tensor) -> Descent:
+        return self._critic_descent("critic", batch, self._target(batch, later, noise, ent_coef))
 
     @th.no_grad()
-    def _target(self, batch: Batch, outputs: Outputs, noise: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
-        _, later = outputs or batch.outputs(self.policy.actor)
+    def _target(self, batch: Batch, later: Distribution, noise: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
         next_q, log_prob = later.expectation(batch.values_after(self.policy.critic_target), noise)
         return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, ent_coef)
 
     @compilable
-    def _climb(
-        self, batch: Batch, outputs: Outputs, noise: th.Tensor, ent_coef: th.Tensor
-    ) -> tuple[Descent, th.Tensor, Distribution]:
-        """The actor's descent, its log-probability (\\*E) and its distribution, detached."""
-        actor = outputs[0] if outputs else self.policy.actor(batch.observations)
-        q, log_prob = actor.expectation(batch.values_at(self.policy.critic), noise)
-        descent = self._descent("actor", learner_loss(0.0, q, 0.0, log_prob, ent_coef, batch.mask))
-        return descent, log_prob.detach(), actor.detach()
+    def _actor_slope(self, batch: Batch, now: Distribution, noise: th.Tensor, ent_coef: th.Tensor) -> tuple[Slope, th.Tensor]:
+        """Of the actor's loss; with its log-probability, detached, shape (\\*E)."""
+        outputs = as_leaves(now)
+        q, log_prob = outputs.expectation(batch.values_at(self.policy.critic), noise)
+        loss = learner_loss(0.0, q, 0.0, log_prob, ent_coef, batch.mask)
+        return Slope(gradient_of(loss, outputs), {"actor_loss": loss.detach()}), log_prob.detach()

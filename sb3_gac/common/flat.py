@@ -45,15 +45,18 @@ class FlatParameters:
             self.flat.data = self._joined(self.parameters)
             self._point_parameters_here()
 
-    def gradient(self, loss: th.Tensor, max_norm: float | None) -> tuple[th.Tensor, th.Tensor]:
+    def gradient(
+        self, outputs: th.Tensor | Sequence[th.Tensor], max_norm: float | None, slopes: Sequence[th.Tensor] | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
         """
-        The loss's gradient with respect to these parameters, and no others.
+        A loss's gradient with respect to these parameters, and no others.
 
-        :param loss: scalar
+        :param outputs: the loss, a scalar, or what it is a function of
         :param max_norm: scale the gradient to a norm of at most this; ``None`` leaves it as it is
+        :param slopes: the loss's gradients with respect to outputs that are not itself
         :return: gradient in the order of ``flat``, zero where there is none; its norm before, scalar
         """
-        found = th.autograd.grad(loss, self.parameters, allow_unused=True)
+        found = th.autograd.grad(outputs, self.parameters, slopes, allow_unused=True)
         gradients = [
             th.zeros_like(p) if gradient is None else gradient for gradient, p in zip(found, self.parameters, strict=True)
         ]

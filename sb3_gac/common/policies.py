@@ -205,6 +205,10 @@ class AsymmetricPolicy(BasePolicy):
         for parameters in (*self.flat_parameters.values(), *self._flat_targets):
             parameters.refresh()
 
+    def flat_tensors(self) -> list[th.Tensor]:
+        """Those that parameters are views of, after :meth:`refresh_parameters`."""
+        return [parameters.flat for parameters in (*self.flat_parameters.values(), *self._flat_targets)]
+
     @property
     def deployed(self) -> DeployedPolicy:
         """The policy that acts at evaluation."""

@@ -5,12 +5,13 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_gac.common.compilation import Program
+from sb3_gac.common.compilation import Program, Staged, StagedProgram, compilable_in_stages
+from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.divergence import check_finite_metrics
 from sb3_gac.common.episodes import EpisodeReplayBuffer, SequenceSamples
 from sb3_gac.common.faults import FaultTolerance
@@ -87,6 +88,39 @@ class Descent(NamedTuple):
     metrics: Metrics
 
 
+class Slope(NamedTuple):
+    """
+    What a loss asks of a policy's outputs.
+
+    :param gradient: with respect to them, in their structure
+    :param metrics: loss and whatever else is to be logged, detached
+    """
+
+    gradient: Distribution
+    metrics: Metrics
+
+
+#: A policy's backward pass: gradient with respect to its outputs -> with respect to its flat parameters, and that one's norm
+Backward: TypeAlias = Callable[[Distribution], tuple[th.Tensor, th.Tensor]]
+
+
+def as_leaves(outputs: Any) -> Any:
+    """
+    :param outputs: of a policy, constants
+    :return: the same, to be differentiated by
+    """
+    return type(outputs)(*(part.detach().requires_grad_() for part in outputs))
+
+
+def gradient_of(loss: th.Tensor, outputs: Any) -> Any:
+    """
+    :param loss: scalar
+    :param outputs: of a policy, see :func:`as_leaves`
+    :return: the loss's gradient with respect to each
+    """
+    return type(outputs)(*th.autograd.grad(loss, outputs, allow_unused=True, materialize_grads=True))
+
+
 class NetworkTraining(FaultTolerance):
     """
     ``train`` for networks that are laid out flat, each with its optimiser: a subclass writes one gradient step.
@@ -102,7 +136,7 @@ class NetworkTraining(FaultTolerance):
     max_grad_norm: float | None
     compile: bool
     mixed_precision: bool
-    programs: dict[Any, Program]
+    programs: dict[Any, Program | StagedProgram]
     program_key: tuple[Any, ...]
     _halves_are_independent: bool
     _halves_together = False
@@ -153,18 +187,6 @@ class NetworkTraining(FaultTolerance):
         """
         return run_halves(tasks, self._halves_together)
 
-    def _descent(self, name: str, loss: th.Tensor, unclipped_loss: th.Tensor | float = 0.0) -> Descent:
-        """
-        The way down a loss for one network, whatever else the loss went through.
-
-        :param name: attribute of the policy
-        :param loss: scalar
-        :param unclipped_loss: of parameters that have no say in the clipping
-        :return: with loss and gradient norm, named after the network
-        """
-        gradient, norm = self.policy.flat_parameters[name].gradient(loss + unclipped_loss, self.max_grad_norm)
-        return Descent(gradient, {f"{name}_loss": loss.detach(), f"{name}_grad_norm": norm})
-
     def _critic_descent(self, name: str, batch: Batch, target: th.Tensor) -> Descent:
         """
         An ensemble's way towards its Bellman targets.
@@ -175,8 +197,34 @@ class NetworkTraining(FaultTolerance):
         :return: with loss, mean Q and gradient norm, named after the ensemble
         """
         q = getattr(self.policy, name)(batch.observations, batch.actions)
-        gradient, metrics = self._descent(name, critic_loss(q, target, batch.mask))
-        return Descent(gradient, {f"{name}_q": masked_mean(q.detach().mean(dim=0), batch.mask)} | metrics)
+        loss = critic_loss(q, target, batch.mask)
+        gradient, norm = self.policy.flat_parameters[name].gradient(loss, self.max_grad_norm)
+        mean_q = masked_mean(q.detach().mean(dim=0), batch.mask)
+        return Descent(gradient, {f"{name}_q": mean_q, f"{name}_loss": loss.detach(), f"{name}_grad_norm": norm})
+
+    @compilable_in_stages
+    def _policy_pass(self, name: str, batch: Batch) -> Staged:
+        """
+        A policy's forward pass, to which its backward pass belongs: call it for the outputs and a :data:`Backward`.
+
+        :param name: attribute of the policy
+        :param batch: B transitions
+        """
+        now, later = batch.outputs(getattr(self.policy, name))
+        slopes = yield now.detach(), later
+        yield self.policy.flat_parameters[name].gradient(now, self.max_grad_norm, slopes)
+
+    def _policy_step(self, name: str, backward: Backward, slope: Slope) -> Metrics:
+        """
+        One step of a policy's optimiser.
+
+        :param name: attribute of the policy
+        :param backward: pass of that policy
+        :param slope: of its loss
+        :return: metrics, with the gradient norm
+        """
+        gradient, norm = backward(slope.gradient)
+        return self._step(name, Descent(gradient, {**slope.metrics, f"{name}_grad_norm": norm}))
 
     def _step(self, name: str, descent: Descent) -> Metrics:
         """

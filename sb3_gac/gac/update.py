@@ -11,18 +11,18 @@ from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.dual import Coefficient
 from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target, masked_mean
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
-from sb3_gac.common.training import Batch, Descent, Metrics
+from sb3_gac.common.training import Backward, Batch, Descent, Metrics, Slope, as_leaves, gradient_of
 from sb3_gac.gac.policies import ActionDistributions, GACPolicy
 
 
 class StepInputs(NamedTuple):
     """
-    What both halves of a gradient step read and neither changes.
+    What both halves of a gradient step read and neither changes: constants.
 
     :param batch: of transitions, \\*E = (B,), or of sequences, \\*E = (T, B)
     :param guider: what its network computes on the observations
     :param learner: the same
-    :param later: what both networks compute on the next observations, as constants
+    :param later: what both networks compute on the next observations
     :param kl_coef: alpha
     :param ent_coef: beta
     """
@@ -58,10 +58,13 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
 
     def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
         """The two halves share nothing that either changes, so they may run at once; the targets follow in :meth:`train`."""
-        inputs = self._run_policies(batch)
+        inputs, guider_backward, learner_backward = self._run_policies(batch)
         noise = th.randn((4, *batch.actions.shape), device=self.device)
         (guider_metrics, kl, log_prob), learner_metrics = self._run_halves(
-            [lambda: self._guider_half(inputs, noise[:2]), lambda: self._learner_half(inputs, noise[2:])]
+            [
+                lambda: self._guider_half(inputs, guider_backward, noise[:2]),
+                lambda: self._learner_half(inputs, learner_backward, noise[2:]),
+            ]
         )
         metrics = guider_metrics | learner_metrics
         metrics |= self.ent_coef_dual.update(log_prob + float(self.target_entropy), batch.mask)
@@ -82,49 +85,43 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     def _auto_learner_pull(self) -> float:
         return 0.0 if self.guider == "residual" else 1.0
 
-    def _run_policies(self, batch: Batch) -> StepInputs:
-        (guider, next_guider), (learner, next_learner) = self._run_halves(
-            [lambda: self._on_both("guider", batch), lambda: self._on_both("learner", batch)]
+    def _run_policies(self, batch: Batch) -> tuple[StepInputs, Backward, Backward]:
+        """Both forward passes; with the guider's backward pass and the learner's."""
+        ((guider, next_guider), guider_backward), ((learner, next_learner), learner_backward) = self._run_halves(
+            [lambda: self._policy_pass("guider", batch), lambda: self._policy_pass("learner", batch)]
         )
-        return StepInputs(
-            batch, guider, learner, (next_guider, next_learner), self.kl_coef_dual.value, self.ent_coef_dual.value
-        )
-
-    @compilable
-    def _on_both(self, name: str, batch: Batch) -> tuple[Distribution, Distribution]:
-        """A policy's outputs on the observations, and, as constants, on the next ones."""
-        return batch.outputs(getattr(self.policy, name))
-
-    def _outputs(self, name: str, inputs: StepInputs) -> Distribution:
-        """What a policy computes on the observations; compiled code can differentiate only what it computes itself."""
-        return getattr(self.policy, name)(inputs.batch.observations) if self.compile else getattr(inputs, name)
+        coefficients = self.kl_coef_dual.value, self.ent_coef_dual.value
+        inputs = StepInputs(batch, guider, learner, (next_guider, next_learner), *coefficients)
+        return inputs, guider_backward, learner_backward
 
     # --- the guider's half ------------------------------------------------------------------------------------------
 
-    def _guider_half(self, inputs: StepInputs, noise: th.Tensor) -> tuple[Metrics, th.Tensor, th.Tensor]:
+    def _guider_half(self, inputs: StepInputs, backward: Backward, noise: th.Tensor) -> tuple[Metrics, th.Tensor, th.Tensor]:
         """
         Eqs. 12 and 13.
 
         :param inputs: of this step
+        :param backward: the guider's
         :param noise: standard normal, for the next action and for the present one, shape (2, \\*E, A)
-        :return: metrics; KL(guider || learner) and the guider's log-probability, detached, each of shape (\\*E)
+        :return: metrics; KL(guider || learner) and the guider's log-probability, each of shape (\\*E)
         """
         metrics = self._step("guider_critic", self._guider_critic_descent(inputs, noise[0]))
-        descent, kl, log_prob = self._guider_descent(inputs, noise[1])
-        return metrics | self._step("guider", descent), kl, log_prob
+        slope, kl, log_prob = self._guider_slope(inputs, noise[1])
+        return metrics | self._policy_step("guider", backward, slope), kl, log_prob
 
     @compilable
     def _guider_critic_descent(self, inputs: StepInputs, noise: th.Tensor) -> Descent:
         return self._critic_descent("guider_critic", inputs.batch, self._guided_target(inputs, noise))
 
     @compilable
-    def _guider_descent(self, inputs: StepInputs, noise: th.Tensor) -> tuple[Descent, th.Tensor, th.Tensor]:
-        """Eq. 13; with KL(guider || learner) and the guider's log-probability, detached, each of shape (\\*E)."""
-        now = self.policy.combine(self._outputs("guider", inputs), inputs.learner)
+    def _guider_slope(self, inputs: StepInputs, noise: th.Tensor) -> tuple[Slope, th.Tensor, th.Tensor]:
+        """Of eq. 13; with KL(guider || learner) and the guider's log-probability, detached, each of shape (\\*E)."""
+        outputs = as_leaves(inputs.guider)
+        now = self.policy.combine(outputs, inputs.learner)
         q, log_prob = now.guider.expectation(inputs.batch.values_at(self.policy.guider_critic), noise)
-        kl = now.guider.kl(now.learner.detach(), self.kl_reduction)
+        kl = now.guider.kl(now.learner, self.kl_reduction)
         loss = guider_loss(kl, log_prob, q, inputs.kl_coef, inputs.ent_coef, inputs.batch.mask)
-        return self._descent("guider", loss), kl.detach(), log_prob.detach()
+        return Slope(gradient_of(loss, outputs), {"guider_loss": loss.detach()}), kl.detach(), log_prob.detach()
 
     @th.no_grad()
     def _guided_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:
@@ -137,29 +134,34 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
 
     # --- the learner's half -----------------------------------------------------------------------------------------
 
-    def _learner_half(self, inputs: StepInputs, noise: th.Tensor) -> Metrics:
+    def _learner_half(self, inputs: StepInputs, backward: Backward, noise: th.Tensor) -> Metrics:
         """
         Eqs. 15 and 16, and the fit of the std for deployment.
 
         :param inputs: of this step
+        :param backward: the learner's
         :param noise: standard normal, for the next action and for the present one, shape (2, \\*E, A)
         :return: metrics
         """
         metrics: Metrics = {}
         if self.policy.learner_critic is not None:
             metrics = self._step("learner_critic", self._learner_critic_descent(inputs, noise[0]))
-        return metrics | self._step("learner", self._learner_descent(inputs, noise[1]))
+        return metrics | self._policy_step("learner", backward, self._learner_slope(inputs, noise[1]))
 
     @compilable
     def _learner_critic_descent(self, inputs: StepInputs, noise: th.Tensor) -> Descent:
         return self._critic_descent("learner_critic", inputs.batch, self._learner_target(inputs, noise))
 
     @compilable
-    def _learner_descent(self, inputs: StepInputs, noise: th.Tensor) -> Descent:
-        now = self.policy.combine(inputs.guider, self._outputs("learner", inputs))
-        losses = self.policy.learner.head.deployment_losses(now.deployed, now.learner, inputs.batch.mask)
-        gradient, metrics = self._descent("learner", self._learner_loss(inputs, now, noise), sum(losses.values()))
-        return Descent(gradient, metrics | {name: loss.detach() for name, loss in losses.items()})
+    def _learner_slope(self, inputs: StepInputs, noise: th.Tensor) -> Slope:
+        """Of eq. 16 and of what else the learner is fitted with."""
+        outputs = as_leaves(inputs.learner)
+        now = self.policy.combine(inputs.guider, outputs)
+        loss = self._learner_loss(inputs, now, noise)
+        fits = self.policy.learner.head.deployment_losses(now.deployed, now.learner, inputs.batch.mask)
+        losses = {"learner_loss": loss, **fits}
+        gradient = gradient_of(loss + sum(fits.values()), outputs)
+        return Slope(gradient, {name: value.detach() for name, value in losses.items()})
 
     @th.no_grad()
     def _learner_target(self, inputs: StepInputs, noise: th.Tensor) -> th.Tensor:

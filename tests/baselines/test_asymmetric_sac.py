@@ -94,8 +94,9 @@ def test_each_loss_moves_its_own_network():
         return {name.split(".")[0] for name, p in model.policy.named_parameters() if not th.equal(p, before[name])}
 
     assert changed(lambda: model._step("critic", model._critic_descent("critic", batch, th.zeros(32)))) == {"critic"}
-    q = model.policy.critic(batch.observations, model.policy.actor(batch.observations).sample())
-    assert changed(lambda: model._step("actor", model._descent("actor", -q.mean()))) == {"actor"}
+    (now, _), backward = model._policy_pass("actor", batch)
+    slope, _ = model._actor_slope(batch, now, th.randn(32, 1), th.tensor(0.1))
+    assert changed(lambda: model._policy_step("actor", backward, slope)) == {"actor"}
 
 
 def test_learns_what_can_be_known_from_the_partial_view():

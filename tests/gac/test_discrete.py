@@ -41,10 +41,11 @@ def test_kl_is_held_at_its_target_where_only_the_guider_knows():
 def test_each_loss_reaches_its_own_network():
     model = small_model(TwoViewChoice(length=5), learning_starts=1000, learner_kl_scale=1.0).learn(64)
     before = {name: p.clone() for name, p in model.policy.named_parameters()}
-    inputs = model._run_policies(model._sample_batch(16))
+    inputs, *backward = model._run_policies(model._sample_batch(16))
     noise = th.zeros(2, 16, 1)
-    for half, moved in ((model._guider_half, "guider"), (model._learner_half, "learner")):
-        half(inputs, noise)
+    halves = (model._guider_half, model._learner_half)
+    for half, moved, backward_pass in zip(halves, ("guider", "learner"), backward, strict=True):
+        half(inputs, backward_pass, noise)
         changed = {name.split(".")[0] for name, p in model.policy.named_parameters() if not th.equal(p, before[name])}
         assert changed == {moved, f"{moved}_critic"}
         before = {name: p.clone() for name, p in model.policy.named_parameters()}

@@ -58,7 +58,7 @@ def test_critic_targets_match_an_independent_computation(guider, learner_entropy
     batch = model._sample_batch(32)
     th.manual_seed(5)
     noise = th.randn(2, 32, 1)
-    inputs = model._run_policies(batch)
+    inputs, *_ = model._run_policies(batch)
     guided = model._guided_target(inputs, noise[0]).double().numpy()
     of_learner = model._learner_target(inputs, noise[1]).double().numpy()
 

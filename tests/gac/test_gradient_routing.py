@@ -98,10 +98,10 @@ def _filled(cls, **arguments):
 def test_updates_leave_the_other_networks_bit_for_bit(cls, critics):
     model = _filled(cls)
     batch = model._sample_batch(32)
-    inputs, noise = model._run_policies(batch), th.randn(2, 32, 1)
+    (inputs, of_guider, of_learner), noise = model._run_policies(batch), th.randn(2, 32, 1)
     own = critics & {"learner_critic"}
-    assert _changed_parts(model, lambda: model._guider_half(inputs, noise)) == {"guider", "guider_critic"}
-    assert _changed_parts(model, lambda: model._learner_half(inputs, noise)) == {"learner"} | own
+    assert _changed_parts(model, lambda: model._guider_half(inputs, of_guider, noise)) == {"guider", "guider_critic"}
+    assert _changed_parts(model, lambda: model._learner_half(inputs, of_learner, noise)) == {"learner"} | own
     targets = {f"{name}_target" for name in critics}
     assert _changed_parts(model, lambda: model.policy.update_targets(0.5)) == targets
 
@@ -110,9 +110,9 @@ def test_updates_leave_the_other_networks_bit_for_bit(cls, critics):
 def test_policy_updates_leave_no_gradient_in_the_critics(cls):
     model = _filled(cls)
     batch = model._sample_batch(32)
-    inputs = model._run_policies(batch)
-    model._step("guider", model._guider_descent(inputs, th.randn(32, 1))[0])
-    model._step("learner", model._learner_descent(inputs, th.randn(32, 1)))
+    inputs, of_guider, of_learner = model._run_policies(batch)
+    model._policy_step("guider", of_guider, model._guider_slope(inputs, th.randn(32, 1))[0])
+    model._policy_step("learner", of_learner, model._learner_slope(inputs, th.randn(32, 1)))
     assert all(p.grad is None for critic, _ in model.policy.critic_pairs.values() for p in critic.parameters())
 
 
@@ -192,11 +192,11 @@ class TestSharedEncoder:
         batch = model._sample_batch(32)
         encoder = model.policy.learner.features_extractor.linear.weight
         before = encoder.detach().clone()
-        inputs, noise = model._run_policies(batch), th.randn(2, 32, 1)
-        model._guider_half(inputs, noise)
+        (inputs, of_guider, of_learner), noise = model._run_policies(batch), th.randn(2, 32, 1)
+        model._guider_half(inputs, of_guider, noise)
         model._step("learner_critic", model._learner_critic_descent(inputs, noise[0]))
         assert th.equal(encoder, before)
-        model._learner_half(inputs, noise)
+        model._learner_half(inputs, of_learner, noise)
         assert not th.equal(encoder, before)
         guider = model.policy.distributions(batch.observations).guider
         assert "learner" not in _reached(model.policy, guider.mean.sum() + guider.log_std.sum())
