@@ -16,7 +16,7 @@ import sb3_gac
 from benchmarks.contenders import timer
 from benchmarks.models import make_model, matmul_rate, step_flops
 
-COMPILED = ("compilation.py", "__call__")
+COMPILED = ("compilation.py", "on_inputs")
 PARTS = {  # of a compiled gradient step -> file and function, none of which calls another
     "optimisers": ("training.py", "_step"),  # the networks'; the dual variables have theirs among their own
     "dual variables": ("dual.py", "update"),
