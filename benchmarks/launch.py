@@ -78,13 +78,13 @@ def launch_one(job: Job, retries: int, engine: Engine) -> None:
 def progress(job: Job) -> tuple[str, str]:
     """
     :param job: in any state
-    :return: steps of its last checkpoint and the learner's return there
+    :return: steps of its last evaluation and the learner's return there
     """
     try:
-        last = json.loads((job.directory / "checkpoint" / "history.json").read_text())[-1]
-    except (OSError, ValueError, IndexError):
+        last = json.loads((job.directory / "timing.json").read_text())
+        return f"{last['steps']} / {job.spec.steps}", f"{last['learner']:.1f}"
+    except (OSError, ValueError, KeyError):
         return ("", "") if job.state == "waiting" else (f"0 / {job.spec.steps}", "")
-    return f"{last['timesteps']:.0f} / {job.spec.steps}", f"{last['learner']:.1f}"
 
 
 def table(jobs: list[Job]) -> Table:

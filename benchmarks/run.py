@@ -29,7 +29,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
 import sb3_gac
-from benchmarks.checkpoint import CheckpointCallback, load_checkpoint, locked, remove_checkpoint, write_atomically
+from benchmarks.checkpoint import checkpoints_of, locked, write_atomically
 from benchmarks.config import instantiate, resolve
 from benchmarks.suite import HERE, RunSpec, made_with, read_suite
 
@@ -70,7 +70,7 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
         _refuse_other_settings(directory / CONFIGURATION, configuration)
         history = _train(spec, directory, algorithm_class, configuration, progress_bar)
         write_evaluations(history, directory / "evaluations.csv")
-        remove_checkpoint(directory)
+        checkpoints_of(algorithm_class, directory).remove()
     return directory
 
 
@@ -93,28 +93,28 @@ def _write_configuration(path: Path, configuration: dict[str, Any], resumed: boo
 
 class Stopwatch(BaseCallback):
     """
-    Seconds and steps from a run's start to its last checkpoint, in whatever processes: what a killed one did after its last
-    checkpoint is done again, and not counted.
+    Seconds and steps from a run's start to its last evaluation, in whatever processes, and that evaluation's return: what a
+    killed one did afterwards is done again, and not counted.
 
     :param path: JSON file
-    :param every: calls between two checkpoints
+    :param evaluation: called before this one
     :param resumed: whether the file's seconds and steps come first
     """
 
-    def __init__(self, path: Path, every: int, resumed: bool):
+    def __init__(self, path: Path, evaluation: sb3_gac.SeededEvalCallback, resumed: bool):
         super().__init__()
-        self._path, self._every, self._started = path, every, time.time()
+        self._path, self._evaluation, self._started = path, evaluation, time.time()
         self._before = json.loads(path.read_text())["seconds"] if resumed and path.exists() else 0.0
 
     def _on_step(self) -> bool:
-        if self.n_calls % self._every == 0:
+        if self.n_calls % self._evaluation.eval_freq == 0:
             self.write()
         return True
 
     def write(self) -> None:
         """Replace the file."""
         spent = {"seconds": self._before + time.time() - self._started, "steps": self.model.num_timesteps}
-        write_atomically(self._path, json.dumps(spent))
+        write_atomically(self._path, json.dumps(spent | {"learner": float(self._evaluation.history[-1]["learner"])}))
 
 
 def _train(
@@ -130,16 +130,17 @@ def _train(
     evaluation = _evaluation_class(algorithm_class)(
         eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=spec.eval_episodes, verbose=0
     )
-    checkpoint = load_checkpoint(algorithm_class, directory, env, spec.seed)
-    _write_configuration(directory / CONFIGURATION, configuration, resumed=checkpoint is not None)
-    stopwatch = Stopwatch(directory / "timing.json", every, resumed=checkpoint is not None)
-    if checkpoint is None:
-        arguments = {"policy": "MultiInputPolicy", **instantiate(configuration["arguments"])}
-        model = algorithm_class(**{**arguments, "env": env, "seed": spec.seed, "device": "cpu"})
+    checkpoints = checkpoints_of(algorithm_class, directory)
+    arguments = {"policy": "MultiInputPolicy", **instantiate(configuration["arguments"]), "seed": spec.seed}
+    resumed = checkpoints.resume(algorithm_class, arguments, env, spec.seed)
+    _write_configuration(directory / CONFIGURATION, configuration, resumed=resumed is not None)
+    stopwatch = Stopwatch(directory / "timing.json", evaluation, resumed=resumed is not None)
+    if resumed is None:
+        model = algorithm_class(env=env, device="cpu", **arguments)
     else:
-        model, evaluation.history = checkpoint
+        model, evaluation.history = resumed
     model.set_logger(configure(str(directory / "tensorboard"), ["tensorboard"]))
-    callbacks = [evaluation, CheckpointCallback(directory, evaluation), stopwatch]
+    callbacks = [evaluation, checkpoints.callback(evaluation, every * spec.envs), stopwatch]
     left = spec.steps - model.num_timesteps
     model.learn(left, callback=callbacks, reset_num_timesteps=False, progress_bar=progress_bar)
     model.save(directory / "model")

@@ -20,7 +20,7 @@ from benchmarks.aggregate import finished_runs
 from benchmarks.checkpoint import locked
 from benchmarks.config import instantiate, read_algorithm, resolve
 from benchmarks.launch import jobs_left
-from benchmarks.run import environment, run
+from benchmarks.run import Stopwatch, environment, run
 from benchmarks.suite import RunSpec, made_with, read_preset, read_suite
 from sb3_gac import GAC
 
@@ -259,41 +259,55 @@ def _assert_finished_as(specs, directory, undisturbed):
         assert files == expected
 
 
-def test_a_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
-    spec = read_suite(SMOKE)[0]
-    original = benchmarks.run.CheckpointCallback
+class _Killed(Stopwatch):
+    """Ends the process's run after its second checkpoint."""
 
-    class Killed(original):
-        def _on_step(self):
-            super()._on_step()
-            if self.num_timesteps == 500:
-                raise KeyboardInterrupt
-            return True
+    def _on_step(self):
+        if self.num_timesteps == 500:
+            raise KeyboardInterrupt
+        return super()._on_step()
 
-    monkeypatch.setattr(benchmarks.run, "CheckpointCallback", Killed)
-    monkeypatch.setattr(benchmarks.run, "provenance", lambda: {"commit": "old", "versions": {"torch": "2"}})
-    with pytest.raises(KeyboardInterrupt):
-        run(spec, tmp_path)
-    monkeypatch.setattr(benchmarks.run, "CheckpointCallback", original)
+
+@pytest.mark.parametrize("algorithm", ["gac", "sac-asym", "sb3-sac"])
+def test_a_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch, algorithm):
+    """Ours end as if they had never been interrupted, to the bit."""
+    spec = replace(read_suite(SMOKE)[0], algorithm=algorithm)
+    if algorithm == "sb3-sac":
+        small = {"learning_starts": 100, "batch_size": 16, "policy_kwargs": {"net_arch": [16]}}
+        spec = replace(spec, preset="sb3", overrides=small)
+    directory, undisturbed = spec.directory(tmp_path), spec.directory(tmp_path / "undisturbed")
+    with monkeypatch.context() as context:
+        context.setattr(benchmarks.run, "Stopwatch", _Killed)
+        context.setattr(benchmarks.run, "provenance", lambda: {"commit": "old", "versions": {"torch": "2"}})
+        with pytest.raises(KeyboardInterrupt):
+            run(spec, tmp_path)
     monkeypatch.setattr(benchmarks.run, "provenance", lambda: {"commit": "new", "versions": {"torch": "2"}})
-    directory = spec.directory(tmp_path)
-    before = json.loads((directory / "checkpoint" / "history.json").read_text())
-    assert [row["timesteps"] for row in before] == [200, 400]
     stopped = json.loads((directory / "timing.json").read_text())
     assert stopped["steps"] == 400
     run(spec, tmp_path)
-    evaluations = pd.read_csv(directory / "evaluations.csv")
-    assert evaluations.learner[:2].tolist() == [row["learner"] for row in before], "taken over, not made again"
     finished = json.loads((directory / "timing.json").read_text())
     assert finished["steps"] == 600
     assert finished["seconds"] > stopped["seconds"]
     origins = made_with(yaml.safe_load((directory / "config.yaml").read_text()))
     assert [origin["commit"] for origin in origins] == ["old", "new"]
-    assert GAC.load(directory / "model").num_timesteps == 600
-    (directory / "evaluations.csv").unlink()
-    run(spec, tmp_path)
-    origins = made_with(yaml.safe_load((directory / "config.yaml").read_text()))
-    assert [origin["commit"] for origin in origins] == ["new"], "from the start again, nothing of the old one is left"
+    assert read_algorithm(algorithm)[0].load(directory / "model").num_timesteps == 600
+    run(spec, tmp_path / "undisturbed")
+    found, expected = (pd.read_csv(path / "evaluations.csv") for path in (directory, undisturbed))
+    assert found.timesteps.tolist() == [200, 400, 600]
+    assert found.learner[:2].tolist() == expected.learner[:2].tolist(), "taken over, not made again"
+    if algorithm != "sb3-sac":
+        pd.testing.assert_frame_equal(found, expected, check_exact=True)
+    assert {path.name for path in directory.iterdir()} == {path.name for path in undisturbed.iterdir()}
+
+
+def test_what_is_left_of_a_finished_run_is_not_gone_on_with(tmp_path, monkeypatch):
+    spec = read_suite(SMOKE)[0]
+    for commit in ("old", "new"):
+        monkeypatch.setattr(benchmarks.run, "provenance", lambda commit=commit: {"commit": commit, "versions": {"torch": "2"}})
+        run(spec, tmp_path)
+        origins = made_with(yaml.safe_load((spec.directory(tmp_path) / "config.yaml").read_text()))
+        assert [origin["commit"] for origin in origins] == [commit], "from the start again, nothing of the old one is left"
+        (spec.directory(tmp_path) / "evaluations.csv").unlink()
 
 
 def test_two_runs_are_never_mixed(tmp_path):
