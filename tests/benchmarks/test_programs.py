@@ -295,8 +295,11 @@ def test_a_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch, algorithm):
     found, expected = (pd.read_csv(path / "evaluations.csv") for path in (directory, undisturbed))
     assert found.timesteps.tolist() == [200, 400, 600]
     assert found.learner[:2].tolist() == expected.learner[:2].tolist(), "taken over, not made again"
-    if algorithm != "sb3-sac":
-        pd.testing.assert_frame_equal(found, expected, check_exact=True)
+    if algorithm != "sb3-sac":  # the other columns are means of what was logged, of which a round is lost with the process
+        returns = [name for name in ("timesteps", "learner", "guider") if name in expected]
+        pd.testing.assert_frame_equal(found[returns], expected[returns], check_exact=True)
+        resumed, model = (read_algorithm(algorithm)[0].load(path / "model") for path in (directory, undisturbed))
+        assert all(th.equal(p, q) for p, q in zip(resumed.policy.parameters(), model.policy.parameters(), strict=True))
     assert {path.name for path in directory.iterdir()} == {path.name for path in undisturbed.iterdir()}
 
 
