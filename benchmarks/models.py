@@ -63,16 +63,18 @@ class SpacesOnly(gym.Env):
         return self.observation_space.sample(), float(self.np_random.standard_normal()), ends, False, {}
 
 
-def make_model(contender: str, sizes: tuple[int, int, int], batch: int, width: int) -> Any:
+def make_model(contender: str, sizes: tuple[int, int, int], batch: int, width: int, buffer_size: int = 4_000) -> Any:
     """
     :param contender: a key of ``CONTENDERS``
     :param sizes: partial, privileged, actions
     :param batch: batch size
     :param width: of the two hidden layers
+    :param buffer_size: of the replay buffer
     :return: a model with a buffer of random transitions
     """
     algorithm, arguments = CONTENDERS[contender]
-    settings = {"batch_size": batch, "learning_starts": 10**9, "buffer_size": 4_000, "seed": 0, "device": "cpu"} | arguments
+    settings = {"batch_size": batch, "learning_starts": 10**9, "buffer_size": buffer_size, "seed": 0, "device": "cpu"}
+    settings |= arguments
     if algorithm.__module__.startswith("sbx"):  # knows no dicts
         env: gym.Env = gym.wrappers.FlattenObservation(SpacesOnly(*sizes))
         model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [width, width]}, **settings)

@@ -156,6 +156,50 @@ def compare_deployment(sizes: tuple[int, int, int], width: int, rounds: int) -> 
     }
 
 
+def compare_checkpoints(sizes: tuple[int, int, int], width: int, capacity: int, more: int) -> dict[str, float]:
+    """
+    :param capacity: transitions in a full replay buffer
+    :param more: transitions until the next checkpoint
+    :return: seconds and megabytes of a first checkpoint, of the next one, and of SB3's ``save`` and ``save_replay_buffer``
+    """
+    gac, sac = (make_model(name, sizes, 256, width, buffer_size=capacity) for name in ("gac", "sac"))
+    for model in (gac, sac):
+        _fill(model.replay_buffer, capacity)
+    with tempfile.TemporaryDirectory() as directory:
+        root = Path(directory)
+        figures = {"first": _writing(lambda: gac.save_checkpoint(root / "ours"), root)}
+        _fill(gac.replay_buffer, more)
+        figures["next"] = _writing(lambda: gac.save_checkpoint(root / "ours"), root)
+        sb3 = _writing(lambda: (sac.save(root / "model"), sac.save_replay_buffer(root / "buffer")), root)
+    return {
+        f"{name}_{unit}": round(value, 2)
+        for name, (seconds, megabytes) in {**figures, "sb3": sb3}.items()
+        for unit, value in (("seconds", seconds), ("megabytes", megabytes))
+    }
+
+
+def _fill(buffer: Any, steps: int) -> None:
+    """With random transitions of one environment, episodes of 1,000 steps."""
+    obs = {key: box.sample()[None] for key, box in buffer.observation_space.items()}
+    action = buffer.action_space.sample()[None]
+    for step in range(steps):
+        following = {key: value + 1e-3 for key, value in obs.items()}
+        buffer.add(obs, following, action, np.zeros(1), np.array([step % 1_000 == 999]), [{}])
+        obs = following
+
+
+def _writing(write: Callable[[], Any], directory: Path) -> tuple[float, float]:
+    """
+    :return: seconds of ``write``, and megabytes of the files that it wrote in the directory
+    """
+    before = {path: path.stat().st_ino for path in directory.rglob("*")}
+    start = time.perf_counter()
+    write()
+    seconds = time.perf_counter() - start
+    written = [path for path in directory.rglob("*") if path.is_file() and before.get(path) != path.stat().st_ino]
+    return seconds, sum(path.stat().st_size for path in written) / 1e6
+
+
 def tabulate_steps(threads: list[int], quick: bool) -> list[dict[str, Any]]:
     """Gradient steps: HalfCheetah with one thread, all sizes with more."""
     rows = []
@@ -206,6 +250,10 @@ TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name
     "rollout": tabulate_rollout,
     "deployment": lambda threads, quick: [
         {"width": width} | compare_deployment(SIZES["HalfCheetah"], width, 3 if quick else ROUNDS) for width in (128, 256)
+    ],
+    "checkpoints": lambda threads, quick: [
+        {"task": task} | compare_checkpoints(sizes, 256, 10_000 if quick else 1_000_000, 2_000 if quick else 20_000)
+        for task, sizes in SIZES.items()
     ],
     "buffers": lambda threads, quick: [{"task": task} | compare_buffers(sizes) for task, sizes in SIZES.items()],
 }

@@ -13,7 +13,7 @@ import torch as th
 from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.models import LoopedGRU, recurrent_step_flops, step_flops
 from benchmarks.profiles import cumulative_seconds, env_step, profile_rollout, profile_step
-from benchmarks.speed import compare_buffers, compare_deployment, compare_recurrent, compare_steps
+from benchmarks.speed import compare_buffers, compare_checkpoints, compare_deployment, compare_recurrent, compare_steps
 from sb3_gac.common.flat import FlatAdam
 
 
@@ -63,6 +63,12 @@ def test_comparisons_give_finite_figures():
     assert "sac-asym_share_of_limit" not in row, "its limit is another"
     assert 0 < row["gac_share_of_limit"] < 1
     assert compare_buffers((169, 270, 17), capacity=6_000)["bytes_over_sb3"] <= 0.52
+
+
+def test_a_next_checkpoint_is_a_part_of_the_first():
+    row = compare_checkpoints((8, 17, 6), width=8, capacity=150_000, more=1_000)
+    assert row["first_megabytes"] > 150_000 * 129 / 1e6 < row["sb3_megabytes"]
+    assert row["next_megabytes"] < 0.5 * row["first_megabytes"]
 
 
 def test_a_looped_gru_is_a_gru():
