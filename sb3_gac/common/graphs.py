@@ -54,15 +54,14 @@ def split(graph: fx.GraphModule, n_first: int) -> tuple[fx.GraphModule, fx.Graph
     results = nodes[-1].args[0]
     inputs = [node for node in nodes if node.op == "placeholder"]
     first = _ancestors(results[:n_first]) | set(inputs)
-    second = [node for node in nodes[:-1] if node not in first]
-    wanted = _ancestors(results[n_first:])
-    kept: dict[fx.Node, None] = {}  # in order
+    second = _ancestors(results[n_first:]) - first
+    kept: dict[fx.Node, None] = dict.fromkeys(node for node in results[n_first:] if node in first)  # in order
     views: set[fx.Node] = set()
-    _sort_out([node for node in second if node in wanted], first, kept, views)
+    _sort_out([node for node in nodes if node in second], first, kept, views)
     saved = [node for node in kept if node not in inputs]
     return (
         _subgraph(graph, inputs, [node for node in nodes if node in first], [*results[:n_first], *saved]),
-        _subgraph(graph, [*inputs, *saved], [node for node in nodes if node in views or node in second], results[n_first:]),
+        _subgraph(graph, [*inputs, *saved], [node for node in nodes if node in views | second], results[n_first:]),
     )
 
 

@@ -46,6 +46,18 @@ def test_two_parts_do_what_one_graph_does():
     assert all(tensor.data_ptr() not in {p.data_ptr() for p in parameters} for tensor in saved), "views are made again"
 
 
+def test_a_result_of_the_second_part_may_be_computed_in_the_first_or_be_an_input():
+    def function(a, b):
+        total = a + b
+        return [total * 2, total, b, total.view(2, 1) - b[0]]
+
+    first, second = split(make_fx(function)(*th.randn(2, 2)), 1)
+    a, b = th.randn(2, 2)
+    doubled, *saved = first(a, b)
+    for found, value in zip([doubled, *second(a, b, *saved)], function(a, b), strict=True):
+        assert th.equal(found, value)
+
+
 def test_inputs_without_a_use_are_dropped():
     graph = make_fx(lambda a, b, c: [a + c])(*th.randn(3, 2))
     assert drop_unused_inputs(graph) == [0, 2]
