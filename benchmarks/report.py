@@ -91,7 +91,10 @@ def draw(tidy: pd.DataFrame, path: Path) -> None:
                     guider = curves(group, "guider")
                     axis.plot(guider.index, guider["mean"], color=color, linestyle="--", linewidth=1)
             axis.set(title=f"{task}, noise {noise:g}", xlabel="environment steps", ylabel="return")
-    axes[0][0].legend(fontsize="small")
+            if cell.empty:
+                axis.set_axis_off()  # not run yet
+    shown = next(axis for axis in axes.flat if axis.get_legend_handles_labels()[0])
+    shown.legend(fontsize="small")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
