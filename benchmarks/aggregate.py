@@ -4,22 +4,31 @@ Finished runs of a suite -> a tidy CSV, and scores as JSON::
     python -m benchmarks.aggregate benchmarks/suites/halfcheetah.yml --out benchmarks/results/halfcheetah
 
 A missing run is an error, not a smaller average; ``--complete-cells`` leaves out the suite's cells of which a run is missing,
-all of their runs, and names them in the results.  Intervals are stratified bootstraps of 95% (rliable, arXiv 2108.13264).
+all of their runs, and names them in the results.  ``--earlier`` takes runs whose directories are elsewhere, or gone, from the
+results that they were aggregated to.  Intervals are stratified bootstraps of 95% (rliable, arXiv 2108.13264).
 """
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 from rliable import library as rly
 from rliable import metrics
 
-from benchmarks.suite import HERE, RunSpec, made_with, read_cells
+from benchmarks.finished import (
+    NAMES,
+    FinishedRun,
+    kind_of,
+    name_of,
+    read_directory,
+    read_results,
+    settings_of,
+)
+from benchmarks.suite import HERE, read_cells
 
 CELL = ["task", "noise"]
 REFERENCE = "sac-asym"
@@ -27,36 +36,39 @@ STEADY_FROM = 5_000
 BOOTSTRAPS = 2_000
 
 
-def finished_runs(suite: Path, runs: Path, complete_cells: bool = False) -> tuple[list[RunSpec], list[str]]:
+def finished_runs(
+    suite: Path, runs: Path, complete_cells: bool = False, earlier: Path | None = None, renewed: Sequence[str] = ()
+) -> tuple[list[FinishedRun], list[str]]:
     """
     :param suite: YAML file
     :param runs: directory of all runs
     :param complete_cells: whether a cell of which a run is missing is left out, instead of an error
-    :return: the runs to count, and the directories of those that are missing
+    :param earlier: results, without a suffix, whose runs count where there is no directory
+    :param renewed: algorithms of which they do not
+    :return: the runs to count, and the names of those that are missing
     :raises FileNotFoundError: naming the runs that are not finished
     :raises ValueError: if a run was made with other settings
     """
     cells = read_cells(suite)
-    complete = [cell for cell in cells if all(spec.is_finished(runs) for spec in cell)]
-    missing = [str(spec.directory(runs)) for cell in cells for spec in cell if not spec.is_finished(runs)]
+    specs = [spec for cell in cells for spec in cell]
+    found = read_results(earlier, [spec for spec in specs if spec.algorithm not in renewed]) if earlier else {}
+    found |= {name_of(spec): read_directory(spec, runs) for spec in specs if spec.is_finished(runs)}
+    missing = [name for name in map(name_of, specs) if name not in found]
+    names = [[name_of(spec) for spec in cell] for cell in cells]
+    complete = [found[name] for cell in names if set(cell) <= set(found) for name in cell]
     if missing and not (complete_cells and complete):
-        raise FileNotFoundError(f"{len(missing)} runs are not finished: {missing}")
-    return [spec for cell in complete for spec in cell], missing
+        raise FileNotFoundError(f"{len(missing)} runs are not finished in {runs}: {missing}")
+    return complete, missing
 
 
-def collect(specs: list[RunSpec], runs: Path) -> pd.DataFrame:
+def collect(runs: list[FinishedRun]) -> pd.DataFrame:
     """
-    :param specs: of finished runs
-    :param runs: directory of all runs
+    :param runs: finished
     :return: one row per evaluation: task, noise, algorithm, seed, timesteps, learner, and guider, kl, ... where there are
     """
-    frames = []
-    for spec in specs:
-        columns = {"task": spec.task, "noise": spec.noise, "algorithm": spec.algorithm, "seed": spec.seed}
-        frames.append(pd.read_csv(spec.directory(runs) / "evaluations.csv").assign(**columns))
+    frames = [run.evaluations.assign(**{name: getattr(run.spec, name) for name in NAMES}) for run in runs]
     tidy = pd.concat(frames, ignore_index=True)
-    first = [*CELL, "algorithm", "seed"]
-    return tidy[[*first, *(column for column in tidy.columns if column not in first)]]
+    return tidy[[*NAMES, *(column for column in tidy.columns if column not in NAMES)]]
 
 
 def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
@@ -64,7 +76,7 @@ def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
     :param tidy: see :func:`collect`
     :return: one row per run: final return, mean return over all evaluations (the area under the curve, over its length)
     """
-    by_run = tidy.sort_values("timesteps").groupby([*CELL, "algorithm", "seed"], sort=False)
+    by_run = tidy.sort_values("timesteps", kind="stable").groupby([*CELL, "algorithm", "seed"], sort=False)
     return by_run.learner.agg(final="last", area="mean").reset_index()
 
 
@@ -225,33 +237,29 @@ def _rounded(estimates: dict[str, tuple[float, tuple[float, float]]]) -> dict[st
     return {name: [round(value, 3) for value in (point, low, high)] for name, (point, (low, high)) in estimates.items()}
 
 
-def origins(suite: Path, specs: list[RunSpec], runs: Path) -> dict[str, Any]:
-    """Command, commits and versions of the runs, their arguments and directories, and the hours that they took."""
-    directories = [str(spec.directory(Path())) for spec in specs]
-    configurations = [yaml.safe_load((spec.directory(runs) / "config.yaml").read_text()) for spec in specs]
-    seconds = [json.loads((spec.directory(runs) / "timing.json").read_text())["seconds"] for spec in specs]
-    origins_of_runs = [made_with(configuration) for configuration in configurations]
+def origins(suite: Path, runs: list[FinishedRun]) -> dict[str, Any]:
+    """Command, commits and versions of the runs, their settings and arguments, and the hours that they took."""
+    made_with = _distinct([origin for run in runs for origin in run.origins])
+    seconds = [run.seconds for run in runs if run.seconds is not None]
     return {
         "command": f"python -m benchmarks.launch benchmarks/suites/{suite.name}",
-        "made_with": _distinct([origin for of_run in origins_of_runs for origin in of_run]),
-        "mixed_runs": [name for name, of_run in zip(directories, origins_of_runs, strict=True) if len(of_run) > 1],
-        "cpus": configurations[0]["cpus"],
+        "made_with": made_with,
+        "mixed_runs": [run.name for run in runs if len(run.origins) > 1],
+        "cpus": runs[0].cpus,
         "hours": round(sum(seconds) / 3600, 2),
-        "seconds_per_run": {"median": round(float(np.median(seconds)), 1), "max": round(max(seconds), 1)},
-        "arguments": _arguments_by_algorithm(specs, configurations),
-        "directories": directories,
+        "timed_runs": len(seconds),
+        "seconds_per_run": {"median": round(float(np.median(seconds)), 1), "max": round(max(seconds), 1)} if seconds else {},
+        "settings": settings_of(runs[0].spec),
+        "arguments": {kind_of(run.spec): run.arguments for run in runs},
+        "runs": {
+            run.name: {"seconds": run.seconds, "made_with": [made_with.index(origin) for origin in run.origins]}
+            for run in runs
+        },
     }
 
 
 def _distinct(origins_of_runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [origin for index, origin in enumerate(origins_of_runs) if origin not in origins_of_runs[:index]]
-
-
-def _arguments_by_algorithm(specs: list[RunSpec], configurations: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        f"{spec.algorithm}, {spec.task}, noise {spec.noise:g}": configuration["arguments"]
-        for spec, configuration in zip(specs, configurations, strict=True)
-    }
 
 
 def main() -> None:
@@ -262,16 +270,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
     parser.add_argument("--reference", help=f"to whose final return steps are counted: {REFERENCE}, or the first, by default")
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
+    parser.add_argument("--earlier", type=Path, help="results, without a suffix, whose runs count where --runs has none")
+    parser.add_argument("--renewed", nargs="+", default=(), metavar="ALGORITHM", help="whose earlier runs do not count")
     options = parser.parse_args()
-    specs, missing = finished_runs(options.suite, options.runs, options.complete_cells)
+    runs, missing = finished_runs(options.suite, options.runs, options.complete_cells, options.earlier, options.renewed)
     evaluations = options.out.with_suffix(".csv")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    collect(specs, options.runs).to_csv(evaluations, index=False, float_format="%.6g")
+    collect(runs).to_csv(evaluations, index=False, float_format="%.6g")
     tidy = pd.read_csv(evaluations, dtype={"noise": float})  # so that the scores follow from the file to the last digit
     reference = choose_reference(list(tidy.algorithm.unique()), options.reference)
     results = {
-        **origins(options.suite, specs, options.runs),
-        "still_to_run": [str(Path(directory).relative_to(options.runs)) for directory in missing],
+        **origins(options.suite, runs),
+        "still_to_run": missing,
         "reference": reference,
         "cells": summarise_cells(tidy, reference),
         **compare(tidy),

@@ -24,7 +24,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#7f7f7f")
-_SHOWN_ELSEWHERE = ("cells", "normalised_iqm", "probability_of_improvement", "directories")
+_SHOWN_ELSEWHERE = ("cells", "normalised_iqm", "probability_of_improvement", "runs")
 STYLE = """
 body {font: 15px sans-serif; margin: 2em}
 table {border-collapse: collapse; margin: 1em 0}
@@ -209,7 +209,7 @@ def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> 
     tables = "".join(_html_table(table) for table in (cells_table(results["cells"]), overall_table(results)))
     plot = interactive(tidy).to_html(full_html=False, include_plotlyjs=True)
     origin = {key: value for key, value in results.items() if key not in _SHOWN_ELSEWHERE}
-    logs = "".join(f"<li>{_link(f'{runs}/{directory}', directory)}</li>" for directory in results["directories"])
+    logs = "".join(f"<li>{_link(f'{runs}/{directory}', directory)}</li>" for directory in results["runs"])
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}</style>'
         f"</head><body><h1>{html.escape(title)}</h1>{plot}{tables}<h2>Configuration and versions</h2>"

@@ -64,7 +64,7 @@ def _page():
         "command": "python -m benchmarks.launch a-suite.yml",
         "made_with": [{"commit": "abc", "versions": {"torch": "2"}}],
     }
-    results = origin | {"hours": 1, "still_to_run": [], "arguments": {"gac": {"tau": 0.01}}, "directories": ["small-1/a run"]}
+    results = origin | {"hours": 1, "still_to_run": [], "arguments": {"gac": {"tau": 0.01}}, "runs": {"small-1/a run": {}}}
     return page(tidy, results | {"cells": summarise_cells(tidy, "sac-asym"), **compare(tidy)}, "a page", "../runs")
 
 

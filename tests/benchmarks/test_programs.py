@@ -16,9 +16,10 @@ import torch as th
 import yaml
 
 import benchmarks.run
-from benchmarks.aggregate import finished_runs
+from benchmarks.aggregate import finished_runs, origins
 from benchmarks.checkpoint import locked
 from benchmarks.config import instantiate, read_algorithm, resolve
+from benchmarks.finished import name_of
 from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, environment, run
 from benchmarks.suite import RunSpec, made_with, read_preset, read_suite
@@ -108,6 +109,58 @@ def test_a_missing_run_is_an_error_or_leaves_its_whole_cell_out(runs, tmp_path):
     assert len(record["still_to_run"]) == 8
     assert "small-600/InvertedDoublePendulum-noise0.2/gac/seed2" in record["still_to_run"]
     assert [cell["seeds"] for cell in record["cells"]] == [[0, 1], [0, 1]]
+
+
+def test_runs_without_their_directories_count_by_the_results_that_they_went_into(runs, tmp_path):
+    program = ("benchmarks.aggregate", SMOKE, "--runs")
+    assert _program(*program, runs, "--out", tmp_path / "made").returncode == 0
+    elsewhere = tmp_path / "elsewhere"
+    result = _program(*program, elsewhere, "--earlier", tmp_path / "made", "--out", tmp_path / "again")
+    assert result.returncode == 0, result.stderr
+    for suffix in (".csv", ".json"):
+        made, again = ((tmp_path / name).with_suffix(suffix).read_text() for name in ("made", "again"))
+        assert again == made
+    names = [name_of(spec) for spec in read_suite(SMOKE)]
+    assert list(json.loads(made)["runs"]) == names
+
+    (elsewhere / names[0]).parent.mkdir(parents=True)
+    shutil.copytree(runs / names[0], elsewhere / names[0])
+    table = pd.read_csv(elsewhere / names[0] / "evaluations.csv")
+    table.assign(learner=7.0).to_csv(elsewhere / names[0] / "evaluations.csv", index=False)
+    counted, missing = finished_runs(SMOKE, elsewhere, earlier=tmp_path / "made")
+    assert [run.name for run in counted] == names
+    assert not missing
+    assert (counted[0].evaluations.learner == 7.0).all(), "a directory comes before what was made earlier"
+    _, missing = finished_runs(SMOKE, runs, True, tmp_path / "made", renewed=["gac"])
+    assert not missing, "directories count in any case"
+    with pytest.raises(FileNotFoundError, match=f"1 runs are not finished in .*{names[2]}"):
+        finished_runs(SMOKE, elsewhere, earlier=tmp_path / "made", renewed=["gac"])
+
+
+def test_hours_are_those_of_the_runs_that_were_timed(runs):
+    counted, _ = finished_runs(SMOKE, runs)
+    some = [run._replace(seconds=seconds) for run, seconds in zip(counted, (None, 1800.0, None, 5400.0), strict=True)]
+    record = origins(SMOKE, some)
+    assert (record["hours"], record["timed_runs"]) == (2.0, 2)
+    assert record["seconds_per_run"] == {"median": 3600.0, "max": 5400.0}
+    record = origins(SMOKE, [run._replace(seconds=None) for run in counted])
+    assert (record["hours"], record["timed_runs"], record["seconds_per_run"]) == (0, 0, {})
+
+
+@pytest.mark.parametrize("change", [{"overrides": {"tau": 0.02}}, {"eval_episodes": 3}])
+def test_earlier_runs_with_other_settings_do_not_count(runs, tmp_path, change):
+    assert _program("benchmarks.aggregate", SMOKE, "--runs", runs, "--out", tmp_path / "made").returncode == 0
+    suite = yaml.safe_load(SMOKE.read_text()) | change
+    path = tmp_path / "changed.yml"
+    path.write_text(yaml.safe_dump(suite))
+    with pytest.raises(FileNotFoundError, match="4 runs are not finished"):
+        finished_runs(path, tmp_path, earlier=tmp_path / "made")
+
+
+def test_results_that_do_not_name_their_runs_are_refused(tmp_path):
+    (tmp_path / "old.json").write_text("{}")
+    with pytest.raises(ValueError, match="does not tell its runs apart"):
+        finished_runs(SMOKE, tmp_path, earlier=tmp_path / "old")
 
 
 def test_a_failing_run_is_named_with_its_log(tmp_path):

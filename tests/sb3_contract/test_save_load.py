@@ -319,7 +319,9 @@ def test_policy_and_actor_are_saved_and_loaded_alone(tmp_path, image):
     _assert_same_tensors(params, loaded.state_dict())
     for one in (loaded, actor):
         np.testing.assert_allclose(actions, one.predict(observations, deterministic=True)[0], rtol=1e-4, atol=1e-6)
-        np.testing.assert_allclose(actions, one.predict({PARTIAL: observations[PARTIAL]}, deterministic=True)[0], rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(
+            actions, one.predict({PARTIAL: observations[PARTIAL]}, deterministic=True)[0], rtol=1e-4, atol=1e-6
+        )
 
 
 @pytest.mark.parametrize("options", [{"guider": "independent", "max_kl": 0.1}, {"role_keys": {"guider": ["privileged"]}}])

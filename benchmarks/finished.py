@@ -1,0 +1,112 @@
+"""Finished runs: from their directories, or, without those, from results that they were aggregated to before."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+import yaml
+
+from benchmarks.config import resolve
+from benchmarks.suite import RunSpec, made_with
+
+#: What tells a suite's runs apart
+NAMES = ["task", "noise", "algorithm", "seed"]
+
+
+class FinishedRun(NamedTuple):
+    """
+    What is left of a run, and what its results are made of.
+
+    :param spec: of the run
+    :param evaluations: one row per evaluation
+    :param arguments: of the algorithm
+    :param origins: commit and versions of the processes that made it
+    :param seconds: that they took, ``None`` if that is not known
+    :param cpus: of the machine
+    """
+
+    spec: RunSpec
+    evaluations: pd.DataFrame
+    arguments: dict[str, Any]
+    origins: list[dict[str, Any]]
+    seconds: float | None
+    cpus: int
+
+    @property
+    def name(self) -> str:
+        """Its directory, below that of all runs."""
+        return name_of(self.spec)
+
+
+def name_of(spec: RunSpec) -> str:
+    """
+    :param spec: of a run
+    :return: its directory, below that of all runs
+    """
+    return str(spec.directory(Path()))
+
+
+def kind_of(spec: RunSpec) -> str:
+    """
+    :param spec: of a run
+    :return: what runs with the same arguments have in common
+    """
+    return f"{spec.algorithm}, {spec.task}, noise {spec.noise:g}"
+
+
+def settings_of(spec: RunSpec) -> dict[str, Any]:
+    """
+    :param spec: of a run
+    :return: what all runs of its suite have in common
+    """
+    return {name: value for name, value in asdict(spec).items() if name not in NAMES}
+
+
+def read_directory(spec: RunSpec, runs: Path) -> FinishedRun:
+    """
+    :param spec: of a finished run
+    :param runs: directory of all runs
+    """
+    directory = spec.directory(runs)
+    configuration = yaml.safe_load((directory / "config.yaml").read_text())
+    return FinishedRun(
+        spec,
+        pd.read_csv(directory / "evaluations.csv"),
+        configuration["arguments"],
+        made_with(configuration),
+        json.loads((directory / "timing.json").read_text())["seconds"],
+        configuration["cpus"],
+    )
+
+
+def read_results(path: Path, specs: list[RunSpec]) -> dict[str, FinishedRun]:
+    """
+    :param path: of results, without a suffix
+    :param specs: of runs that may be among them
+    :return: name -> those that are, if they were made with the settings and arguments that the spec has now
+    :raises ValueError: if the results do not tell their runs apart
+    """
+    results = json.loads(path.with_suffix(".json").read_text())
+    if "runs" not in results:
+        raise ValueError(f"{path}.json does not tell its runs apart: it was aggregated before they could be taken up again.")
+    tidy = pd.read_csv(path.with_suffix(".csv"), dtype={"noise": float})
+    evaluations = dict(list(tidy.groupby(NAMES)))
+    return {name_of(spec): _recorded(spec, results, evaluations) for spec in specs if _is_among(results, spec)}
+
+
+def _is_among(results: Mapping[str, Any], spec: RunSpec) -> bool:
+    return (
+        name_of(spec) in results["runs"]
+        and results["settings"] == settings_of(spec)
+        and results["arguments"][kind_of(spec)] == resolve(spec)[1]
+    )
+
+
+def _recorded(spec: RunSpec, results: Mapping[str, Any], evaluations: Mapping[Any, pd.DataFrame]) -> FinishedRun:
+    of_run = results["runs"][name_of(spec)]
+    rows = evaluations[tuple(getattr(spec, name) for name in NAMES)].drop(columns=NAMES).dropna(axis=1, how="all")
+    origins = [results["made_with"][index] for index in of_run["made_with"]]
+    return FinishedRun(spec, rows, results["arguments"][kind_of(spec)], origins, of_run["seconds"], results["cpus"])
