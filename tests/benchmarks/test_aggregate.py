@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 import benchmarks.aggregate
-from benchmarks.aggregate import choose_reference, compare, summarise_cells
+from benchmarks.aggregate import choose_reference, compare, run_scores, summarise_cells
 
 
 @pytest.fixture(autouse=True)
@@ -115,3 +115,10 @@ def test_the_reference_is_one_that_is_there():
     assert choose_reference(["gac", "sac-asym"], "gac") == "gac"
     with pytest.raises(ValueError, match=r"reference must be one of \['gac'\], got 'sac'"):
         choose_reference(["gac"], "sac")
+
+
+def test_runs_keep_their_order_whatever_a_machine_sorts_with():
+    """Unstable sorts differ between processors, and with the order the intervals' random numbers."""
+    names = [f"a{number}" for number in np.random.default_rng(0).permutation(200)]
+    tidy = pd.concat([_evaluations(name, 0, [0, 1]) for name in names])
+    assert run_scores(tidy).algorithm.tolist() == names
