@@ -62,8 +62,8 @@ class TanhGaussian(NamedTuple):
         return q_function(action), log_prob
 
     def kl(self, other: "TanhGaussian", reduction: str = "mean") -> th.Tensor:
-        """KL(self || other), shape (\\*E), with the std that ``other`` borrowed: see :func:`kl_shared_std`."""
-        return kl_shared_std(self.mean, other.mean, other.log_std.exp(), reduction)
+        """KL(self || other), shape (\\*E), with the std of ``other``, which both have: see :func:`kl_shared_std`."""
+        return kl_shared_std(self.mean, other.mean, other.log_std.detach().exp(), reduction)
 
     def corrected(self, correction: "TanhGaussian") -> "TanhGaussian":
         """

@@ -27,5 +27,8 @@ class GACShare(GAC):
 class GACWithoutQ(GACShare):
     """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14, whatever ``learner_kl_scale``)."""
 
+    def _learner_can_train_a_std(self) -> bool:
+        return False
+
     def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
         return distillation_loss(now.guider.detach().kl(now.learner, self.kl_reduction), inputs.batch.mask)

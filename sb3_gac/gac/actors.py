@@ -4,6 +4,7 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy, RolePolicy
 from sb3_gac.common.distributions import Distribution, TanhGaussian, project_to_kl_ball
@@ -15,16 +16,36 @@ class Learner(DeployedPolicy):
     """
     The deployed policy.
 
-    In training a Gaussian borrows the guider's std. Its own, fitted to the guider's, serves
-    ``predict(deterministic=False)`` where there is no guider.
+    :param owns_std: whether a Gaussian's std is trained by the learner's objective; if not, it borrows the guider's in
+        training, and its own, fitted to that, serves ``predict(deterministic=False)`` where there is no guider
     """
+
+    def __init__(self, *args: Any, owns_std: bool = True, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.owns_std = owns_std
 
     def output(self, latent: th.Tensor) -> Distribution:
         r"""
         :param latent: shape (\*E, H)
-        :return: at deployment; the gradient of a std stops at its own layer; shapes (\*E, A)
+        :return: at deployment; the gradient of a std that is fitted stops at its own layer; shapes (\*E, A)
         """
-        return self.head(latent, detach_std=True)
+        return self.head(latent, detach_std=not self.owns_std)
+
+    def deployment_parameters(self) -> list[nn.Parameter]:
+        """Those that serve at deployment only."""
+        return [] if self.owns_std else self.head.deployment_parameters()
+
+    def deployment_losses(self, deployed: Any, learner: Any, mask: th.Tensor | None = None) -> dict[str, th.Tensor]:
+        r"""
+        :param deployed: what :meth:`output` returned, shapes (\*E, A)
+        :param learner: with the std that it has in training, shapes (\*E, A)
+        :param mask: shape (\*E)
+        :return: name -> scalar, what :meth:`deployment_parameters` are fitted with
+        """
+        return {} if self.owns_std else self.head.deployment_losses(deployed, learner, mask)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {"owns_std": self.owns_std}
 
 
 class Guider(RolePolicy):

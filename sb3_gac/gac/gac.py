@@ -17,7 +17,7 @@ from sb3_gac.common.distributions import KL_REDUCTIONS
 from sb3_gac.common.dual import make_coefficient
 from sb3_gac.common.roles import RoleKeys
 from sb3_gac.gac.actors import GUIDERS
-from sb3_gac.gac.policies import GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
+from sb3_gac.gac.policies import STD_OF, GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
 from sb3_gac.gac.update import GuidedUpdate
 
 KL_COEF_START = 1.0
@@ -37,6 +37,8 @@ class GAC(GuidedUpdate):
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
     :param guider: "residual": learner plus a privileged correction; "independent": a network of its own (the paper's)
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
+    :param std_of: whose standard deviation both policies have, "learner" or "guider"; the other borrows it as a constant.
+        "auto" is the guider's, the paper's, unless the guider is residual and the learner has an entropy term
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
         is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
         learner: a pull towards it closes no gap, and the learner chases what moves along with it
@@ -77,6 +79,7 @@ class GAC(GuidedUpdate):
         kl_reduction: str = "mean",
         guider: str = "residual",
         max_kl: float | None = None,
+        std_of: str = "auto",
         learner_kl_scale: str | float = "auto",
         learner_entropy: bool = True,
         max_grad_norm: float | None = 1.0,
@@ -131,6 +134,7 @@ class GAC(GuidedUpdate):
         self.kl_reduction = kl_reduction
         self.guider = guider
         self.max_kl = max_kl
+        self.std_of = std_of
         self.learner_kl_scale = learner_kl_scale
         self.learner_entropy = learner_entropy
         if _init_setup_model:
@@ -145,6 +149,12 @@ class GAC(GuidedUpdate):
         check_choice("kl_reduction", self.kl_reduction, KL_REDUCTIONS)
         check_choice("learner_entropy", self.learner_entropy, (False, True))
         check_choice("guider", self.guider, GUIDERS)
+        check_choice("std_of", self.std_of, ("auto", *STD_OF))
+        if self.std_of == "learner" and not self._learner_can_train_a_std():
+            raise ValueError(
+                'std_of="learner" needs an entropy term in the learner\'s objective, or nothing keeps its std from falling: '
+                'leave std_of "auto", or give GAC or GACShare learner_entropy=True.'
+            )
         if self.max_kl is not None:
             check_positive("max_kl", self.max_kl, remedy="or None for no hard bound")
             if not isinstance(self.action_space, spaces.Box):
@@ -152,11 +162,16 @@ class GAC(GuidedUpdate):
         if self.learner_kl_scale != "auto":
             check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
 
+    def _learner_can_train_a_std(self) -> bool:
+        return self.learner_entropy
+
     def _policy_options(self) -> dict[str, Any]:
+        own = self.guider == "residual" and self._learner_can_train_a_std()
         return super()._policy_options() | {
             "guider": self.guider,
             "max_kl": self.max_kl,
             "kl_reduction": self.kl_reduction,
+            "std_of": self.std_of if self.std_of != "auto" else ("learner" if own else "guider"),
         }
 
     def _setup_coefficients(self) -> None:

@@ -15,13 +15,16 @@ from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
 from sb3_gac.common.roles import Roles
 from sb3_gac.gac.actors import GUIDERS, Learner
 
+STD_OF = ("learner", "guider")
+
 
 class ActionDistributions(NamedTuple):
     """
     Both policies for one batch.
 
     :param guider: shapes (B, A)
-    :param learner: a Gaussian with the guider's std, as a constant, shapes (B, A)
+    :param learner: as it is in training, shapes (B, A); Gaussians have one std, which is a constant in that of the two
+        that borrows it
     :param deployed: the learner by itself, shapes (B, A)
     """
 
@@ -44,6 +47,7 @@ class GACPolicy(AsymmetricPolicy):
     :param max_kl: hard bound on KL(guider || learner), or ``None``
     :param kl_reduction: how that KL is reduced over action dimensions, "mean" or "sum"
     :param learner_critics: whether the learner has critics of its own
+    :param std_of: whose std both Gaussians have, one of ``STD_OF``
     :param log_std_bounds: smallest and largest log standard deviation before tanh
     :param features_extractor_class: encoder, made once per role on the entries of that role
     :param features_extractor_kwargs: keyword arguments for it
@@ -72,6 +76,7 @@ class GACPolicy(AsymmetricPolicy):
         max_kl: float | None = None,
         kl_reduction: str = "mean",
         learner_critics: bool = True,
+        std_of: str = "learner",
         log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
         **kwargs: Any,
     ):
@@ -81,9 +86,11 @@ class GACPolicy(AsymmetricPolicy):
             "max_kl": max_kl,
             "kl_reduction": kl_reduction,
             "learner_critics": learner_critics,
+            "std_of": std_of,
             "log_std_bounds": log_std_bounds,
         }
-        self.learner = Learner(**self._role_kwargs("learner"), log_std_bounds=log_std_bounds)
+        owns_std = std_of == "learner"
+        self.learner = Learner(**self._role_kwargs("learner"), log_std_bounds=log_std_bounds, owns_std=owns_std)
         shared = self.learner.features_extractor if self.share_features_extractor else None
         bounds: dict[str, Any] = {"log_std_bounds": log_std_bounds, "max_kl": max_kl, "kl_reduction": kl_reduction}
         self.guider = GUIDERS[guider](**self._role_kwargs("guider", shared), **bounds)
@@ -91,7 +98,7 @@ class GACPolicy(AsymmetricPolicy):
         self.learner_critic, self.learner_critic_target = None, None
         if learner_critics:
             self.learner_critic, self.learner_critic_target = self._make_critic_and_target("learner_critic", shared)
-        self._finish(lr_schedule, unclipped=len(self.learner.head.deployment_parameters()))
+        self._finish(lr_schedule, unclipped=len(self.learner.deployment_parameters()))
 
     @property
     def actor(self) -> Learner:
@@ -128,8 +135,12 @@ class GACPolicy(AsymmetricPolicy):
         :param learner_output: of the learner's network, for the same batch
         :return: shapes (B, A)
         """
-        guider = self.guider.relative_to(learner_output, guider_output)
-        return ActionDistributions(guider, learner_output.borrowing(guider), learner_output)  # type: ignore[arg-type]
+        guider: Any = guider_output
+        learner: Any = learner_output
+        if self.learner.owns_std:
+            return ActionDistributions(self.guider.relative_to(learner, guider.borrowing(learner)), learner, learner)
+        guider = self.guider.relative_to(learner, guider)
+        return ActionDistributions(guider, learner.borrowing(guider), learner)
 
     def behaviour_action(
         self,

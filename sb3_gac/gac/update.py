@@ -158,7 +158,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         outputs = as_leaves(inputs.learner)
         now = self.policy.combine(inputs.guider, outputs)
         loss = self._learner_loss(inputs, now, noise)
-        fits = self.policy.learner.head.deployment_losses(now.deployed, now.learner, inputs.batch.mask)
+        fits = self.policy.learner.deployment_losses(now.deployed, now.learner, inputs.batch.mask)
         losses = {"learner_loss": loss, **fits}
         gradient = gradient_of(loss + sum(fits.values()), outputs)
         return Slope(gradient, {name: value.detach() for name, value in losses.items()})

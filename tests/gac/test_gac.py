@@ -7,13 +7,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_gac import GAC, GACShare, GACWithoutQ
+from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
 from tests.gac.helpers import learner_inputs
 from tests.helpers import TwoViewBandit, small_model
 
 LOGGED = {
     *("kl", "kl_p95", "kl_above_target", "target_kl", "kl_coef", "kl_coef_loss", "kl_coef_on_bound"),
-    *("entropy", "ent_coef", "ent_coef_loss", "actor_loss", "guider_loss", "learner_loss", "critic_loss", "log_std_loss"),
+    *("entropy", "ent_coef", "ent_coef_loss", "actor_loss", "guider_loss", "learner_loss", "critic_loss"),
     *("guider_critic_loss", "learner_critic_loss", "guider_critic_q", "learner_critic_q", "learning_rate", "n_updates"),
     *("guider_grad_norm", "learner_grad_norm", "guider_critic_grad_norm", "learner_critic_grad_norm"),
 }
@@ -47,11 +47,12 @@ def _log_prob(noise, std, action):
     return (-(noise**2) / 2 - np.log(std) - np.log(2 * np.pi) / 2 - np.log(1 - action**2))[:, 0]
 
 
-@pytest.mark.parametrize("learner_entropy", [True, False])
+@pytest.mark.parametrize(("learner_entropy", "std_of"), [(True, "learner"), (True, "guider"), (False, "guider")])
 @pytest.mark.parametrize("guider", ["residual", "independent"])
-def test_critic_targets_match_an_independent_computation(guider, learner_entropy):
+def test_critic_targets_match_an_independent_computation(guider, learner_entropy, std_of):
     """Eqs. 12 and 15 from the raw weights, in numpy and float64, with the sampling noise replayed."""
-    model = small_model(guider=guider, kl_coef=0.7, ent_coef=0.2, learning_starts=1000, learner_entropy=learner_entropy)
+    arguments = {"guider": guider, "std_of": std_of, "learner_entropy": learner_entropy}
+    model = small_model(kl_coef=0.7, ent_coef=0.2, learning_starts=1000, **arguments)
     model.learn(64)
     with th.no_grad():  # a guider that differs from its learner
         model.policy.guider.head.mean.bias.add_(0.3)
@@ -66,9 +67,10 @@ def test_critic_targets_match_an_independent_computation(guider, learner_entropy
     weights = _numpy_state(model.policy)
     o, s = (batch.next_observations[key].double().numpy() for key in ("partial", "privileged"))
     full = np.concatenate([o, s], axis=1)
-    (learner_mean,) = _mlp(o, weights, "learner", ["head.mean"])
-    output, log_std = _mlp(full, weights, "guider", ["head.mean", "head.log_std"])
-    std = np.exp(log_std)
+    heads = ["head.mean", "head.log_std"]
+    learner_mean, learner_log_std = _mlp(o, weights, "learner", heads)
+    output, guider_log_std = _mlp(full, weights, "guider", heads)
+    std = np.exp(learner_log_std if std_of == "learner" else guider_log_std)
     guider_mean = learner_mean + std * output if guider == "residual" else output
     kl = (((guider_mean - learner_mean) / std) ** 2 / 2).mean(axis=1)
     action = np.tanh(guider_mean + std * guider_noise)
@@ -118,11 +120,13 @@ def test_the_guider_collects_and_the_learner_is_evaluated():
     assert scaled[0, 0] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_everything_is_logged():
-    model = small_model()
+@pytest.mark.parametrize(("std_of", "more"), [("learner", set()), ("guider", {"log_std_loss"})])
+def test_everything_is_logged(std_of, more):
+    model = small_model(std_of=std_of)
     model.learn(30)
     logged = {name.removeprefix("train/") for name in model.logger.name_to_value if name.startswith("train/")}
-    assert logged >= LOGGED
+    assert logged >= LOGGED | more
+    assert ("log_std_loss" in logged) == ("log_std_loss" in more)
     values = [value for name, value in model.logger.name_to_value.items() if name.startswith("train/")]
     assert np.isfinite(values).all()
 
@@ -253,6 +257,50 @@ def test_learner_objective_matches_an_independent_computation(learner_entropy):
     q = _ensemble(x, _numpy_state(model.policy), "learner_critic").min(axis=0)
     bonus = 0.2 * _log_prob(noise, std, action) if learner_entropy else 0.0
     assert loss == pytest.approx((0.5 * 0.7 * kl + bonus - q).mean(), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("cls", "arguments", "owner"),
+    [
+        (GAC, {}, "learner"),
+        (GAC, {"learner_entropy": False}, "guider"),
+        (GAC, {"guider": "independent"}, "guider"),
+        (GAC, {"guider": "independent", "std_of": "learner"}, "learner"),
+        (GAC, {"std_of": "guider"}, "guider"),
+        (GACShare, {}, "learner"),
+        (GACWithoutQ, {}, "guider"),
+    ],
+)
+def test_whose_std_both_policies_have(cls, arguments, owner):
+    policy = small_model(cls=cls, **arguments).policy
+    assert policy.constructor_options["std_of"] == owner
+    assert policy.learner.owns_std == (owner == "learner")
+
+
+@pytest.mark.parametrize(("cls", "arguments"), [(GAC, {"learner_entropy": False}), (GACWithoutQ, {})])
+def test_a_learner_without_an_entropy_term_cannot_train_a_std(cls, arguments):
+    with pytest.raises(ValueError, match='std_of="learner" needs an entropy term'):
+        small_model(cls=cls, std_of="learner", **arguments)
+
+
+def test_the_learners_update_is_that_of_sac_with_asymmetric_critics(monkeypatch):
+    """With a residual guider the guider's only say is in the data: on the same batches and noise, the same networks."""
+    arguments = {"ent_coef": 0.2, "learning_starts": 1000, "max_grad_norm": 1.0}
+    model, sac = small_model(**arguments).learn(64), small_model(cls=AsymmetricSAC, **arguments)
+    sac._setup_learn(64)
+    pairs = [("learner", "actor"), ("learner_critic", "critic"), ("learner_critic_target", "critic_target")]
+    for ours, theirs in pairs:
+        getattr(sac.policy, theirs).load_state_dict(getattr(model.policy, ours).state_dict())
+    for _ in range(5):
+        batch, noise = model._sample_batch(32), th.randn(2, 32, 1)
+        monkeypatch.setattr(th, "randn", lambda shape, noise=noise, **_: th.cat([th.zeros_like(noise), noise])[-shape[0] :])
+        for one in (model, sac):
+            one._gradient_step(batch)
+            one.policy.update_targets(0.1)
+        monkeypatch.undo()
+    for ours, theirs in pairs:
+        for name, value in getattr(model.policy, ours).state_dict().items():
+            th.testing.assert_close(getattr(sac.policy, theirs).state_dict()[name], value, rtol=1e-4, atol=1e-6)
 
 
 def test_target_entropy_conventions():

@@ -30,9 +30,14 @@ def _reached(policy, loss):
     return parts
 
 
-@pytest.fixture(params=["residual", "independent"])
+#: Guider, and whose std both policies have
+FORMS = [("residual", "learner"), ("residual", "guider"), ("independent", "learner"), ("independent", "guider")]
+
+
+@pytest.fixture(params=FORMS, ids="-".join)
 def model(request):
-    return small_model(guider=request.param)
+    guider, std_of = request.param
+    return small_model(guider=guider, std_of=std_of)
 
 
 def test_guider_loss_moves_the_guider_alone(model):
@@ -49,14 +54,33 @@ def test_learner_kl_moves_the_learner_alone_and_not_its_log_std_head(model):
     assert _reached(model.policy, distillation_loss(kl)) == {"learner"}
 
 
-def test_learner_q_term_has_a_gradient_for_the_mean_but_not_for_the_borrowed_std(model):
+def test_learner_q_term_has_a_gradient_for_the_mean_and_for_the_std_unless_it_is_borrowed(model):
     obs = _observations()
     _, learner, _ = model.policy.distributions(obs)
     q = model.policy.learner_critic(obs, learner.sample())
-    assert _reached(model.policy, learner_loss(th.zeros(8), q, 1.0)) == {"learner", "learner_critic"}
+    own = {"learner_log_std"} if model.std_of == "learner" else set()
+    assert _reached(model.policy, learner_loss(th.zeros(8), q, 1.0)) == {"learner", "learner_critic"} | own
 
 
-def test_log_std_loss_moves_its_head_alone(model):
+def test_guider_q_term_has_a_gradient_for_the_mean_and_for_the_std_unless_it_is_borrowed(model):
+    obs = _observations()
+    guider, *_ = model.policy.distributions(obs)
+    q = model.policy.guider_critic(obs, guider.sample())
+    assert _reached(model.policy, -q.mean()) == {"guider", "guider_critic"}
+    reaches_std = model.policy.guider.head.log_std.weight.grad is not None
+    assert reaches_std == (model.std_of == "guider")
+
+
+def test_both_policies_have_one_std(model):
+    guider, learner, _ = model.policy.distributions(_observations())
+    assert th.equal(guider.log_std, learner.log_std)
+    owner = getattr(model.policy, model.std_of)
+    assert th.equal(guider.log_std, owner(_observations()).log_std)
+
+
+@pytest.mark.parametrize("guider", ["residual", "independent"])
+def test_log_std_loss_moves_its_head_alone(guider):
+    model = small_model(guider=guider, std_of="guider")
     guider, _, deployed = model.policy.distributions(_observations())
     loss = log_std_loss(deployed.log_std, guider.log_std.detach() + 1)
     assert _reached(model.policy, loss) == {"learner_log_std"}
@@ -144,9 +168,9 @@ def test_guider_does_depend_on_privileged():
     assert obs["privileged"].grad.abs().sum() > 0
 
 
-def test_the_log_std_head_has_no_say_in_the_clipping_of_the_learner():
+def test_a_log_std_head_that_is_fitted_has_no_say_in_the_clipping_of_the_learner():
     """Its gradient belongs to another loss: a huge one must not shrink the learner's."""
-    model = _filled(GAC, max_grad_norm=1.0)
+    model = _filled(GAC, max_grad_norm=1.0, std_of="guider")
     head = list(model.policy.learner.head.log_std.parameters())
     flat = model.policy.flat_parameters["learner"]
     assert [id(p) for p in flat.parameters[-2:]] == [id(p) for p in head]

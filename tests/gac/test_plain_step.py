@@ -2,6 +2,7 @@
 
 from copy import deepcopy
 
+import pytest
 import torch as th
 from torch import nn
 
@@ -30,6 +31,7 @@ class PlainGAC:
 
     def __init__(self, model):
         policy = model.policy
+        self.learner_owns_std = model.std_of == "learner"
         self.learner, self.guider = _plain_actor(policy.learner), _plain_actor(policy.guider)
         self.theta, self.phi = _plain_critics(policy.guider_critic), _plain_critics(policy.learner_critic)
         self.theta_bar, self.phi_bar = deepcopy(self.theta), deepcopy(self.phi)
@@ -42,9 +44,11 @@ class PlainGAC:
 
     def policies(self, obs):
         o, s = obs["partial"], th.cat([obs["partial"], obs["privileged"]], dim=1)
-        mean = self.learner["mean"](self.learner["latent_net"](o))
+        seen_by_learner = self.learner["latent_net"](o)
+        mean = self.learner["mean"](seen_by_learner)
         hidden = self.guider["latent_net"](s)
-        std = self.guider["log_std"](hidden).clamp(-5, 1).exp()
+        log_std = self.learner["log_std"](seen_by_learner) if self.learner_owns_std else self.guider["log_std"](hidden)
+        std = log_std.clamp(-5, 1).exp()
         guider_mean = mean.detach() + std.detach() * self.guider["mean"](hidden)
         return mean, guider_mean, std
 
@@ -84,15 +88,17 @@ class PlainGAC:
             loss = sum(0.5 * ((q - y) ** 2).mean() for q in self.q(critics, obs, batch.actions))
             self.descend(critics, loss, critics.parameters())
         kl = (((guider_mean - mean.detach()) / std.detach()) ** 2 / 2).mean(dim=1)
-        action, log_prob = self.sample(guider_mean, std, noise[1])
+        action, log_prob = self.sample(guider_mean, std.detach() if self.learner_owns_std else std, noise[1])
         loss = (alpha * kl + beta * log_prob - th.minimum(*self.q(self.theta, obs, action))).mean()
         self.descend(self.guider, loss, self.guider.parameters())
-        action, learner_log_prob = self.sample(mean, std.detach(), noise[3])
+        action, learner_log_prob = self.sample(mean, std if self.learner_owns_std else std.detach(), noise[3])
         loss = (beta * learner_log_prob - th.minimum(*self.q(self.phi, obs, action))).mean()
-        latent = self.learner["latent_net"](obs["partial"]).detach()
-        head_loss = 0.5 * ((self.learner["log_std"](latent).clamp(-5, 1) - std.detach().log()) ** 2).mean()
-        clipped = [*self.learner["latent_net"].parameters(), *self.learner["mean"].parameters()]
-        self.descend(self.learner, loss + head_loss, clipped)
+        clipped = list(self.learner.parameters())
+        if not self.learner_owns_std:
+            latent = self.learner["latent_net"](obs["partial"]).detach()
+            loss = loss + 0.5 * ((self.learner["log_std"](latent).clamp(-5, 1) - std.detach().log()) ** 2).mean()
+            clipped = [*self.learner["latent_net"].parameters(), *self.learner["mean"].parameters()]
+        self.descend(self.learner, loss, clipped)
         violations = (kl.detach() - TARGET_KL, log_prob.detach() + self.target_entropy)
         for log_coef, violation, optimizer in zip(
             (self.log_alpha, self.log_beta), violations, self.dual_optimizers, strict=True
@@ -106,12 +112,13 @@ class PlainGAC:
                     q.copy_(TAU * p + (1 - TAU) * q)
 
 
-def test_the_fast_step_is_the_plain_step():
-    model = small_model(learning_starts=1000, learning_rate=RATE)
+@pytest.mark.parametrize("std_of", ["learner", "guider"])
+def test_the_fast_step_is_the_plain_step(std_of):
+    model = small_model(learning_starts=1000, learning_rate=RATE, std_of=std_of)
     model.learn(64)
     with th.no_grad():  # a guider that differs from its learner, a std that differs between states
         model.policy.guider.head.mean.bias.add_(0.3)
-        model.policy.guider.head.log_std.weight.mul_(3.0)
+        getattr(model.policy, std_of).head.log_std.weight.mul_(3.0)
     plain = PlainGAC(model)
     for seed in range(4):
         batch = model._sample_batch(32)
