@@ -46,7 +46,7 @@ class GaussianHead(nn.Module):
         return TanhGaussian(self.mean(latent), log_std.clamp(*self.log_std_bounds))
 
     def deployment_parameters(self) -> list[nn.Parameter]:
-        """Those that serve at deployment only, where there is no guider to borrow a standard deviation from."""
+        """Those that serve at deployment only, if the standard deviation of training is the guider's."""
         return list(self.log_std.parameters())
 
     @staticmethod

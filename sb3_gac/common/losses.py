@@ -140,7 +140,7 @@ def learner_loss(
     :param kl: KL(sg mu || pi), shape (\\*E)
     :param q: critics at (s, a), a from the learner and reparameterised, frozen, shape (N, \\*E)
     :param kl_coef: alpha
-    :param log_prob: log pi(a|o) under the borrowed std, shape (\\*E)
+    :param log_prob: log pi(a|o), shape (\\*E)
     :param ent_coef: beta, or 0 for the equation as printed
     :param mask: shape (\\*E)
     :return: scalar
