@@ -47,7 +47,8 @@ class GACPolicy(AsymmetricPolicy):
     :param max_kl: hard bound on KL(guider || learner), or ``None``
     :param kl_reduction: how that KL is reduced over action dimensions, "mean" or "sum"
     :param learner_critics: whether the learner has critics of its own
-    :param std_of: whose std both Gaussians have, one of ``STD_OF``
+    :param std_of: whose std both Gaussians have, one of ``STD_OF``; what the other's network says of its own counts at most
+        at deployment
     :param log_std_bounds: smallest and largest log standard deviation before tanh
     :param features_extractor_class: encoder, made once per role on the entries of that role
     :param features_extractor_kwargs: keyword arguments for it

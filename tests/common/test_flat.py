@@ -98,7 +98,7 @@ def test_a_copied_policy_trains_on(network):
     model.train(1, 16)
     for name in (
         "learner.head.mean.weight",
-        "guider.head.log_std.bias",
+        "guider.head.mean.bias",
         "learner_critic.output.bias",
         "guider_critic_target.output.bias",
     ):
