@@ -85,11 +85,14 @@ def work(directory: Path, steps: int, interval: int, seed: int) -> None:
         (directory / "end.json").write_text(json.dumps({"steps": model.num_timesteps, "parameters": parameters}))
 
 
-def disturb(directory: Path, arguments: list[str], until: float, pause: tuple[float, float], seed: int) -> list[str]:
+def disturb(
+    directory: Path, arguments: list[str], until: float, least: int, pause: tuple[float, float], seed: int
+) -> list[str]:
     """
     :param directory: of a run
     :param arguments: of its worker
     :param until: time of the last kill, which is one by SIGTERM
+    :param least: kills that there are in any case, however long they take
     :param pause: shortest and longest time between two kills, in seconds of training
     :param seed: of the moments and of the signals
     :return: the signals that ended it
@@ -102,7 +105,7 @@ def disturb(directory: Path, arguments: list[str], until: float, pause: tuple[fl
         with subprocess.Popen(_command(directory, arguments)) as worker:
             while _starts(directory) == before and worker.poll() is None:
                 time.sleep(0.05)
-            last = time.time() >= until
+            last = time.time() >= until and len(kills) + 1 >= least
             time.sleep(generator.uniform(*pause))
             number = signal.SIGTERM if last else generator.choice([signal.SIGKILL, signal.SIGTERM])
             if worker.poll() is not None:
@@ -141,6 +144,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("directory", type=Path)
     parser.add_argument("--minutes", type=float, default=60, help="during which it is disturbed")
+    parser.add_argument("--kills", type=int, default=1, help="at least, however long they take")
     parser.add_argument("--steps", type=int, default=FOREVER, help=argparse.SUPPRESS)
     parser.add_argument("--interval", type=int, default=2_000, help="steps between two checkpoints")
     parser.add_argument("--pause", type=float, nargs=2, default=(5, 60), help="seconds of training between two kills")
@@ -169,7 +173,7 @@ def soak(options: argparse.Namespace) -> dict[str, Any]:
         directory.mkdir()
     common = [f"--interval={options.interval}", f"--seed={options.seed}"]
     until = started + 60 * options.minutes
-    kills = disturb(disturbed, [*common, f"--steps={FOREVER}"], until, tuple(options.pause), options.seed)
+    kills = disturb(disturbed, [*common, f"--steps={FOREVER}"], until, options.kills, tuple(options.pause), options.seed)
     minutes = (time.time() - started) / 60
     end = json.loads((disturbed / "end.json").read_text())
     subprocess.run(_command(undisturbed, [*common, f"--steps={end['steps']}"]), check=True)
