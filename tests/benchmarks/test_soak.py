@@ -19,7 +19,7 @@ def test_killed_training_ends_where_undisturbed_training_does(tmp_path):
         [sys.executable, "-m", "benchmarks.soak", str(tmp_path / "soak"), *options], check=True, capture_output=True
     )
     report = json.loads(out.read_text())
-    assert report["kills"]["SIGKILL"] + report["kills"]["SIGTERM"] == 4
+    assert report["kills"] == {"SIGKILL": 2, "SIGTERM": 2}, "the seed's"
     assert report["steps"] > 100
     assert report["steps_lost"]["largest"] <= 100 + 2  # both environments' step under way
     assert report["same_as_undisturbed"]
