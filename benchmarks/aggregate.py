@@ -37,13 +37,13 @@ BOOTSTRAPS = 2_000
 
 
 def finished_runs(
-    suite: Path, runs: Path, complete_cells: bool = False, earlier: Path | None = None, renewed: Sequence[str] = ()
+    suite: Path, runs: Path, complete_cells: bool = False, earlier: Sequence[Path] = (), renewed: Sequence[str] = ()
 ) -> tuple[list[FinishedRun], list[str]]:
     """
     :param suite: YAML file
     :param runs: directory of all runs
     :param complete_cells: whether a cell of which a run is missing is left out, instead of an error
-    :param earlier: results, without a suffix, whose runs count where there is no directory
+    :param earlier: results, without a suffix, whose runs count where there is no directory; the later over the earlier ones
     :param renewed: algorithms of which they do not
     :return: the runs to count, and the names of those that are missing
     :raises FileNotFoundError: naming the runs that are not finished
@@ -51,7 +51,9 @@ def finished_runs(
     """
     cells = read_cells(suite)
     specs = [spec for cell in cells for spec in cell]
-    found = read_results(earlier, [spec for spec in specs if spec.algorithm not in renewed]) if earlier else {}
+    found: dict[str, FinishedRun] = {}
+    for results in earlier:
+        found |= read_results(results, [spec for spec in specs if spec.algorithm not in renewed])
     found |= {name_of(spec): read_directory(spec, runs) for spec in specs if spec.is_finished(runs)}
     missing = [name for name in map(name_of, specs) if name not in found]
     names = [[name_of(spec) for spec in cell] for cell in cells]
@@ -270,7 +272,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
     parser.add_argument("--reference", help=f"to whose final return steps are counted: {REFERENCE}, or the first, by default")
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
-    parser.add_argument("--earlier", type=Path, help="results, without a suffix, whose runs count where --runs has none")
+    parser.add_argument(
+        "--earlier", type=Path, nargs="+", default=(), help="results, without a suffix, whose runs count where --runs has none"
+    )
     parser.add_argument("--renewed", nargs="+", default=(), metavar="ALGORITHM", help="whose earlier runs do not count")
     options = parser.parse_args()
     runs, missing = finished_runs(options.suite, options.runs, options.complete_cells, options.earlier, options.renewed)

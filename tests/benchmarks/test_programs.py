@@ -127,14 +127,19 @@ def test_runs_without_their_directories_count_by_the_results_that_they_went_into
     shutil.copytree(runs / names[0], elsewhere / names[0])
     table = pd.read_csv(elsewhere / names[0] / "evaluations.csv")
     table.assign(learner=7.0).to_csv(elsewhere / names[0] / "evaluations.csv", index=False)
-    counted, missing = finished_runs(SMOKE, elsewhere, earlier=tmp_path / "made")
+    counted, missing = finished_runs(SMOKE, elsewhere, earlier=[tmp_path / "made"])
     assert [run.name for run in counted] == names
     assert not missing
     assert (counted[0].evaluations.learner == 7.0).all(), "a directory comes before what was made earlier"
-    _, missing = finished_runs(SMOKE, runs, True, tmp_path / "made", renewed=["gac"])
+    table = pd.read_csv(tmp_path / "made.csv")
+    table.assign(learner=8.0).to_csv(tmp_path / "later.csv", index=False)
+    shutil.copy(tmp_path / "made.json", tmp_path / "later.json")
+    counted, _ = finished_runs(SMOKE, elsewhere, earlier=[tmp_path / "made", tmp_path / "later"])
+    assert [run.evaluations.learner.iloc[0] for run in counted] == [7.0, 8.0, 8.0, 8.0], "the last of several counts"
+    _, missing = finished_runs(SMOKE, runs, True, [tmp_path / "made"], renewed=["gac"])
     assert not missing, "directories count in any case"
     with pytest.raises(FileNotFoundError, match=f"1 runs are not finished in .*{names[2]}"):
-        finished_runs(SMOKE, elsewhere, earlier=tmp_path / "made", renewed=["gac"])
+        finished_runs(SMOKE, elsewhere, earlier=[tmp_path / "made"], renewed=["gac"])
 
 
 def test_hours_are_those_of_the_runs_that_were_timed(runs):
@@ -154,13 +159,13 @@ def test_earlier_runs_with_other_settings_do_not_count(runs, tmp_path, change):
     path = tmp_path / "changed.yml"
     path.write_text(yaml.safe_dump(suite))
     with pytest.raises(FileNotFoundError, match="4 runs are not finished"):
-        finished_runs(path, tmp_path, earlier=tmp_path / "made")
+        finished_runs(path, tmp_path, earlier=[tmp_path / "made"])
 
 
 def test_results_that_do_not_name_their_runs_are_refused(tmp_path):
     (tmp_path / "old.json").write_text("{}")
     with pytest.raises(ValueError, match="does not tell its runs apart"):
-        finished_runs(SMOKE, tmp_path, earlier=tmp_path / "old")
+        finished_runs(SMOKE, tmp_path, earlier=[tmp_path / "old"])
 
 
 def test_a_failing_run_is_named_with_its_log(tmp_path):
