@@ -78,7 +78,7 @@ def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
     :param tidy: see :func:`collect`
     :return: one row per run: final return, mean return over all evaluations (the area under the curve, over its length)
     """
-    by_run = tidy.sort_values("timesteps", kind="stable").groupby([*CELL, "algorithm", "seed"], sort=False)
+    by_run = tidy.sort_values("timesteps", kind="stable").groupby(NAMES, sort=False)
     return by_run.learner.agg(final="last", area="mean").reset_index()
 
 

@@ -181,7 +181,7 @@ def soak(options: argparse.Namespace) -> dict[str, Any]:
     memory = [float(line.split(",")[2]) for line in lines if line.startswith("step")]
     lost = losses(lines)
     return {
-        "command": f"python -m benchmarks.soak {options.directory.name} --minutes {options.minutes:g} {' '.join(common)}",
+        "command": f"python -m benchmarks.soak {options.directory.name} --minutes {options.minutes:g} --kills {options.kills} {' '.join(common)}",
         **provenance(),
         "minutes": round(minutes, 1),
         "kills": {number: kills.count(number) for number in ("SIGKILL", "SIGTERM")},
