@@ -175,13 +175,14 @@ def soak(options: argparse.Namespace) -> dict[str, Any]:
     until = started + 60 * options.minutes
     kills = disturb(disturbed, [*common, f"--steps={FOREVER}"], until, options.kills, tuple(options.pause), options.seed)
     minutes = (time.time() - started) / 60
+    asked = [f"--minutes {options.minutes:g}", f"--kills {options.kills}", *common]
     end = json.loads((disturbed / "end.json").read_text())
     subprocess.run(_command(undisturbed, [*common, f"--steps={end['steps']}"]), check=True)
     lines = (disturbed / "progress.csv").read_text().splitlines()
     memory = [float(line.split(",")[2]) for line in lines if line.startswith("step")]
     lost = losses(lines)
     return {
-        "command": f"python -m benchmarks.soak {options.directory.name} --minutes {options.minutes:g} --kills {options.kills} {' '.join(common)}",
+        "command": f"python -m benchmarks.soak {options.directory.name} {' '.join(asked)}",
         **provenance(),
         "minutes": round(minutes, 1),
         "kills": {number: kills.count(number) for number in ("SIGKILL", "SIGTERM")},

@@ -5,6 +5,7 @@ What is privileged says only what a player with a perfect memory knows: never a 
 POPGym (extra ``popgym``) is imported when a task is made.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -39,12 +40,12 @@ class Summary:
     def __init__(self, game: Any):
         self.game = game
 
+    @abstractmethod
     def of(self, observation: Any) -> np.ndarray:
         """
         :param observation: the game's newest
         :return: shape (size,)
         """
-        raise NotImplementedError  # pragma: no cover
 
 
 class CardToName(Summary):
@@ -57,8 +58,9 @@ class CardToName(Summary):
         card = self._card()
         return _one_hot(np.array(4 if card is None else self.game.deck.suits_idx[card]), 5)
 
+    @abstractmethod
     def _card(self) -> Any:
-        raise NotImplementedError  # pragma: no cover
+        """What is to be named, None if nothing is."""
 
 
 class LastCardLeft(CardToName):
