@@ -8,11 +8,13 @@ STEPS ?= 50000
 SEED ?= 0
 RUNS ?= runs
 SUITE ?= smoke
+EARLIER ?=
 WORKERS ?= auto
 ARGS ?=
 
 BIN := $(VENV)/bin
 CODE := sb3_gac benchmarks tests
+OF_EARLIER := $(if $(EARLIER),--earlier $(EARLIER))
 
 .PHONY: train test benchmark format lint type clean
 
@@ -32,8 +34,8 @@ test: $(VENV)/.installed-dev  ## run the tests, several at a time
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(ARGS)
 
 benchmark: $(VENV)/.installed-dev  ## runs of a suite, resumed if need be, to figure, tables and page in benchmarks/results/
-	$(BIN)/python -m benchmarks.launch benchmarks/suites/$(SUITE).yml
-	$(BIN)/python -m benchmarks.aggregate benchmarks/suites/$(SUITE).yml --out benchmarks/results/$(SUITE)
+	$(BIN)/python -m benchmarks.launch benchmarks/suites/$(SUITE).yml $(OF_EARLIER)
+	$(BIN)/python -m benchmarks.aggregate benchmarks/suites/$(SUITE).yml $(OF_EARLIER) --out benchmarks/results/$(SUITE)
 	$(BIN)/python -m benchmarks.report benchmarks/results/$(SUITE)
 
 format: $(VENV)/.installed-dev

@@ -22,10 +22,11 @@ from rliable import metrics
 from benchmarks.finished import (
     NAMES,
     FinishedRun,
+    add_earlier_options,
     kind_of,
     name_of,
     read_directory,
-    read_results,
+    read_earlier,
     settings_of,
 )
 from benchmarks.suite import HERE, read_cells
@@ -51,9 +52,7 @@ def finished_runs(
     """
     cells = read_cells(suite)
     specs = [spec for cell in cells for spec in cell]
-    found: dict[str, FinishedRun] = {}
-    for results in earlier:
-        found |= read_results(results, [spec for spec in specs if spec.algorithm not in renewed])
+    found = read_earlier(earlier, specs, renewed)
     found |= {name_of(spec): read_directory(spec, runs) for spec in specs if spec.is_finished(runs)}
     missing = [name for name in map(name_of, specs) if name not in found]
     names = [[name_of(spec) for spec in cell] for cell in cells]
@@ -272,10 +271,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
     parser.add_argument("--reference", help=f"to whose final return steps are counted: {REFERENCE}, or the first, by default")
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
-    parser.add_argument(
-        "--earlier", type=Path, nargs="+", default=(), help="results, without a suffix, whose runs count where --runs has none"
-    )
-    parser.add_argument("--renewed", nargs="+", default=(), metavar="ALGORITHM", help="whose earlier runs do not count")
+    add_earlier_options(parser)
     options = parser.parse_args()
     runs, missing = finished_runs(options.suite, options.runs, options.complete_cells, options.earlier, options.renewed)
     evaluations = options.out.with_suffix(".csv")

@@ -1,7 +1,8 @@
 """Finished runs: from their directories, or, without those, from results that they were aggregated to before."""
 
+import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -82,7 +83,28 @@ def read_directory(spec: RunSpec, runs: Path) -> FinishedRun:
     )
 
 
-def read_results(path: Path, specs: list[RunSpec]) -> dict[str, FinishedRun]:
+def add_earlier_options(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: of a program that counts earlier runs, see :func:`read_earlier`
+    """
+    parser.add_argument(
+        "--earlier", type=Path, nargs="+", default=(), help="results, without a suffix, whose runs count where --runs has none"
+    )
+    parser.add_argument("--renewed", nargs="+", default=(), metavar="ALGORITHM", help="whose earlier runs do not count")
+
+
+def read_earlier(earlier: Sequence[Path], specs: Sequence[RunSpec], renewed: Sequence[str]) -> dict[str, FinishedRun]:
+    """
+    :param earlier: results, without a suffix; the later over the earlier ones
+    :param specs: of runs that may be among them
+    :param renewed: algorithms whose runs do not count
+    :return: name -> those that are, see :func:`read_results`
+    """
+    wanted = [spec for spec in specs if spec.algorithm not in renewed]
+    return {name: run for results in earlier for name, run in read_results(results, wanted).items()}
+
+
+def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]:
     """
     :param path: of results, without a suffix
     :param specs: of runs that may be among them

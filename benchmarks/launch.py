@@ -4,14 +4,16 @@ A suite -> its runs, several side by side with one thread each::
     python -m benchmarks.launch benchmarks/suites/halfcheetah.yml --jobs 2
 
 Finished runs are skipped and unfinished ones go on from their checkpoints, so an interrupted launch is resumed by the same
-command.  A failed run is tried again.  ``--dry-run`` prints the commands of what is left to do.  ``--engine ray`` runs on a
-Ray cluster whose nodes share this checkout, its Python and the runs' directory.
+command; runs whose directories are elsewhere, or gone, count as finished if ``--earlier`` results have them.  A failed run is
+tried again.  ``--dry-run`` prints the commands of what is left to do.  ``--engine ray`` runs on a Ray cluster whose nodes
+share this checkout, its Python and the runs' directory.
 """
 
 import argparse
 import json
 import shlex
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +23,7 @@ from rich.live import Live
 from rich.table import Table
 
 from benchmarks.engines import Engine, LocalEngine, RayEngine
+from benchmarks.finished import add_earlier_options, name_of, read_earlier
 from benchmarks.suite import HERE, RunSpec, read_suite
 
 
@@ -46,14 +49,17 @@ class Job:
         return self.directory / "log.txt"
 
 
-def jobs_left(suite: Path, runs: Path) -> tuple[list[Job], int]:
+def jobs_left(suite: Path, runs: Path, earlier: Sequence[Path] = (), renewed: Sequence[str] = ()) -> tuple[list[Job], int]:
     """
     :param suite: YAML file
     :param runs: directory of all runs
+    :param earlier: results, without a suffix, whose runs are finished too
+    :param renewed: algorithms of which they are not
     :return: the runs that are not finished, and how many are
     """
     specs = read_suite(suite)
-    left = [(index, spec) for index, spec in enumerate(specs) if not spec.is_finished(runs)]
+    made = read_earlier(earlier, specs, renewed)
+    left = [(index, spec) for index, spec in enumerate(specs) if not spec.is_finished(runs) and name_of(spec) not in made]
     jobs = [Job(spec, spec.directory(runs), run_command(suite, index, runs)) for index, spec in left]
     return jobs, len(specs) - len(left)
 
@@ -126,9 +132,10 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, help="runs side by side; default: one on each CPU")
     parser.add_argument("--retries", type=int, default=1, help="further attempts after a run that failed")
     parser.add_argument("--runs", type=Path, default=HERE / "runs")
+    add_earlier_options(parser)
     parser.add_argument("--dry-run", action="store_true", help="print the commands of what is left to do")
     options = parser.parse_args()
-    jobs, finished = jobs_left(options.suite.resolve(), options.runs.resolve())
+    jobs, finished = jobs_left(options.suite.resolve(), options.runs.resolve(), options.earlier, options.renewed)
     if options.dry_run:
         print("\n".join(shlex.join(job.command) for job in jobs))
         return

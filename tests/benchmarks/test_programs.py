@@ -142,6 +142,18 @@ def test_runs_without_their_directories_count_by_the_results_that_they_went_into
         finished_runs(SMOKE, elsewhere, earlier=[tmp_path / "made"], renewed=["gac"])
 
 
+def test_launch_leaves_out_what_earlier_results_have(runs, tmp_path):
+    made = tmp_path / "made"
+    assert _program("benchmarks.aggregate", SMOKE, "--runs", runs, "--out", made).returncode == 0
+    command = ("benchmarks.launch", SMOKE, "--runs", tmp_path / "elsewhere", "--earlier", made)
+    assert "4 were finished before, 0 now, 0 failed." in _program(*command).stdout
+    jobs, finished = jobs_left(SMOKE, tmp_path / "elsewhere", [made], renewed=["gac"])
+    assert finished == 2
+    assert [job.spec.algorithm for job in jobs] == ["gac", "gac"]
+    shutil.copytree(jobs[0].spec.directory(runs), jobs[0].directory)
+    assert jobs_left(SMOKE, tmp_path / "elsewhere", [made], renewed=["gac"])[1] == 3, "a directory counts in any case"
+
+
 def test_hours_are_those_of_the_runs_that_were_timed(runs):
     counted, _ = finished_runs(SMOKE, runs)
     some = [run._replace(seconds=seconds) for run, seconds in zip(counted, (None, 1800.0, None, 5400.0), strict=True)]
