@@ -7,6 +7,7 @@ Each is a ``gymnasium.Wrapper``, picklable, and passes gymnasium's and SB3's env
     env = History(SensorNoise(env, noise_std=0.1), length=4, actions=True)
 """
 
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -140,16 +141,16 @@ class _EntryWrapper(gym.Wrapper):
         :return: changed observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        changed = {**observation, self._key: self._next(observation[self._key], action)}
+        changed = {**observation, self._key: self._next(observation[self._key], action, reward)}
         return changed, reward, terminated, truncated, info
 
+    @abstractmethod
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         """The entry after a reset."""
-        raise NotImplementedError  # pragma: no cover
 
-    def _next(self, value: np.ndarray, action: Any) -> np.ndarray:
+    @abstractmethod
+    def _next(self, value: np.ndarray, action: Any, reward: Any) -> np.ndarray:
         """The entry after a step."""
-        raise NotImplementedError  # pragma: no cover
 
 
 class SensorNoise(_EntryWrapper):
@@ -189,7 +190,7 @@ class SensorNoise(_EntryWrapper):
             self._n_used = len(self._drawn)
         return self._noisy(value)
 
-    def _next(self, value: np.ndarray, action: Any) -> np.ndarray:
+    def _next(self, value: np.ndarray, action: Any, reward: Any) -> np.ndarray:
         return self._noisy(value)
 
     def _noisy(self, value: np.ndarray) -> np.ndarray:
@@ -240,7 +241,7 @@ class History(_EntryWrapper):
         self._actions.extend([self._no_action] * (self._actions.maxlen or 0))
         return self._joined()
 
-    def _next(self, value: np.ndarray, action: Any) -> np.ndarray:
+    def _next(self, value: np.ndarray, action: Any, reward: Any) -> np.ndarray:
         self._values.append(value.copy())  # the environment may write into it again
         if self._no_action.size:
             self._actions.append(np.array(action, dtype=np.float32).ravel())
@@ -281,19 +282,13 @@ class PreviousAction(_EntryWrapper):
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         return np.concatenate([value, self._nothing], dtype=self._entry.dtype)
 
-    def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
-        """
-        :param action: of the environment
-        :return: changed observation, reward, terminated, truncated, info
-        """
-        observation, reward, terminated, truncated, info = self.env.step(action)
+    def _next(self, value: np.ndarray, action: Any, reward: Any) -> np.ndarray:
         if isinstance(self.action_space, spaces.Discrete):
             taken = np.eye(int(self.action_space.n))[int(action) - int(self.action_space.start)]
         else:
             taken = np.ravel(action)
-        parts = [observation[self._key], taken, [reward]] if self._reward else [observation[self._key], taken]
-        changed = {**observation, self._key: np.concatenate(parts, dtype=self._entry.dtype, casting="unsafe")}
-        return changed, reward, terminated, truncated, info
+        parts = [value, taken, [reward]] if self._reward else [value, taken]
+        return np.concatenate(parts, dtype=self._entry.dtype, casting="unsafe")
 
 
 def _count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
