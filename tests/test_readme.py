@@ -1,0 +1,37 @@
+"""The README's Python, run as it stands there, but for shorter trainings."""
+
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_gac import GAC
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+SHORTER = {"100_000": "600", "1_000_000": "300", "5_000": "150", "20_000": "100"}
+SMALL = {"learning_starts": 100, "batch_size": 16, "buffer_size": 1_000, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
+
+
+def _shorter(block):
+    return re.sub(r"\b[0-9]+_[0-9_]+\b", lambda number: SHORTER[number.group()], block)
+
+
+def _names_by_then():
+    """What the text around a block has told the reader to have."""
+    env, eval_env = (gym.make("sb3_gac/HalfCheetah-v5", noise_std=0.1) for _ in range(2))
+    model = GAC("MultiInputPolicy", env, **SMALL).learn(150)
+    partial = env.observation_space["partial"].sample()
+    return {"gymnasium": gym, "np": np, "GAC": GAC, "env": env, "eval_env": eval_env, "model": model, "partial": partial}
+
+
+@pytest.mark.parametrize("number", range(len(BLOCKS)))
+def test_the_python_of_the_readme_runs(number, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(_shorter(BLOCKS[number]), f"README.md, block {number}", "exec"), _names_by_then())
+
+
+def test_there_is_python_in_the_readme():
+    assert len(BLOCKS) >= 6
