@@ -92,7 +92,8 @@ def draw(tidy: pd.DataFrame, path: Path) -> None:
                     axis.plot(guider.index, guider["mean"], color=color, linestyle="--", linewidth=1)
             axis.set(title=f"{task}, noise {noise:g}", xlabel="environment steps", ylabel="return")
             if cell.empty:
-                axis.set_axis_off()  # not run yet
+                axis.set_axis_off()
+                axis.text(0.5, 0.5, "not run yet", ha="center", transform=axis.transAxes)
     shown = next(axis for axis in axes.flat if axis.get_legend_handles_labels()[0])
     shown.legend(fontsize="small")
     figure.savefig(path, dpi=110)
