@@ -181,18 +181,31 @@ def train(options: argparse.Namespace) -> Path:
         "learner_std": learner_std,
         "random": random,
         "random_std": random_std,
+        "steps": model.num_timesteps,
         "minutes": minutes,
         "history": [{key: float(value) for key, value in row.items()} for row in callback.history],
     }
     (directory / "results.json").write_text(json.dumps(results, indent=1))
-    print(f"\nTrained GAC on {env_id} (noise {options.noise:g}) for {model.num_timesteps} steps in {minutes:.1f} minutes.")
-    print(f"Learner, seeing `{PARTIAL}` alone: return {learner:.0f} +- {learner_std:.0f} over {options.episodes} episodes.")
-    print(f"Random actions, same seeds: {random:.0f} +- {random_std:.0f}.")
-    print(f"Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:")
-    print(f'    from sb3_gac import GAC; model = GAC.load("{directory / "model"}")')
-    print(f'    action, _ = model.predict({{"{PARTIAL}": observation}}, deterministic=True)')
     return directory
 
 
+def summary(directory: Path) -> str:
+    """
+    :param directory: that :func:`train` returned
+    :return: what came out, and how to use it
+    """
+    options = yaml.safe_load((directory / "config.yaml").read_text())
+    results = json.loads((directory / "results.json").read_text())
+    task, noise, episodes = (options[name] for name in ("task", "noise", "episodes"))
+    learner, random = (f"{results[name]:.0f} +- {results[f'{name}_std']:.0f}" for name in ("learner", "random"))
+    return f"""
+Trained GAC on sb3_gac/{task}-v5 (noise {noise:g}) for {results["steps"]} steps in {results["minutes"]:.1f} minutes.
+Learner, seeing `{PARTIAL}` alone: return {learner} over {episodes} episodes.
+Random actions, same seeds: {random}.
+Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:
+    from sb3_gac import GAC; model = GAC.load("{directory / "model"}")
+    action, _ = model.predict({{"{PARTIAL}": observation}}, deterministic=True)"""
+
+
 if __name__ == "__main__":
-    train(parse_arguments())
+    print(summary(train(parse_arguments())))

@@ -7,10 +7,10 @@ import pytest
 import yaml
 
 from sb3_gac import GAC
-from sb3_gac.train import PartialOnly, gac_arguments, parse_arguments, train
+from sb3_gac.train import PartialOnly, gac_arguments, parse_arguments, summary, train
 
 
-def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_path, capsys):
+def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_path):
     options = ["--task", "InvertedDoublePendulum", "--noise", "0.1", "--steps", "2400", "--seed", "3", "--episodes", "2"]
     directory = train(parse_arguments([*options, "--runs", str(tmp_path)]))
     assert directory.parent == tmp_path
@@ -21,8 +21,11 @@ def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_pat
     results = json.loads((directory / "results.json").read_text())
     assert np.isfinite([results["learner"], results["random"]]).all()
     assert len(results["history"]) == 10
-    last_lines = capsys.readouterr().out
-    assert f"return {results['learner']:.0f}" in last_lines
+    last_lines = summary(directory)
+    assert f"(noise 0.1) for {results['steps']} steps" in last_lines
+    assert results["steps"] == 2400
+    assert f"return {results['learner']:.0f} +- {results['learner_std']:.0f} over 2 episodes" in last_lines
+    assert f"same seeds: {results['random']:.0f} +- {results['random_std']:.0f}." in last_lines
     assert f'GAC.load("{directory / "model"}")' in last_lines
     action, _ = GAC.load(directory / "model").predict({"partial": np.zeros(5, np.float32)}, deterministic=True)
     assert action.shape == (1,)

@@ -5,7 +5,7 @@ What is privileged says only what a player with a perfect memory knows: never a 
 POPGym (extra ``popgym``) is imported when a task is made.
 """
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -28,7 +28,7 @@ def _one_hot(values: np.ndarray, n_values: int) -> np.ndarray:
     return np.eye(n_values, dtype=np.float32)[np.ravel(values)].ravel()
 
 
-class Summary:
+class Summary(ABC):
     """
     What a player with a perfect memory knows, as a vector in [0, 1].
 

@@ -7,7 +7,7 @@ Each is a ``gymnasium.Wrapper``, picklable, and passes gymnasium's and SB3's env
     env = History(SensorNoise(env, noise_std=0.1), length=4, actions=True)
 """
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -114,7 +114,7 @@ class SplitDictObservation(_SplitWrapper):
         }
 
 
-class _EntryWrapper(gym.Wrapper):
+class _EntryWrapper(gym.Wrapper, ABC):
     """Base of wrappers that change one entry of a Dict observation."""
 
     def __init__(self, env: gym.Env, key: str):
