@@ -137,14 +137,23 @@ def export_learner(
 
 def _normalizer_of(model: AsymmetricOffPolicyAlgorithm) -> DeploymentNormalizer | None:
     vec_normalize = model.get_vec_normalize_env()
-    if vec_normalize is not None:
-        return DeploymentNormalizer.from_vec_normalize(vec_normalize, model.policy.role_keys[model.policy.roles.deployed])
-    if model.trained_normalised:
+    if vec_normalize is None and model.trained_normalised:
         raise ValueError(
             "The model learned from observations that VecNormalize normalised, but was loaded without it: load it with "
             'env=VecNormalize.load("<its statistics>", venv), or pass normalizer=DeploymentNormalizer.from_vec_normalize(...).'
         )
-    return None
+    if vec_normalize is None:
+        return None
+    keys = model.policy.role_keys[model.policy.roles.deployed]
+    normalizer = DeploymentNormalizer.from_vec_normalize(vec_normalize, keys)
+    wrapper = model.replay_source.in_the_way
+    if wrapper is not None and normalizer.mean:
+        raise ValueError(
+            f"{type(wrapper).__name__} stands outside VecNormalize: what the policy reads of {list(normalizer.mean)} is not "
+            "what VecNormalize has statistics of. Train with it outermost, or pass normalizer=DeploymentNormalizer(...) "
+            "with the statistics of what the policy reads."
+        )
+    return normalizer
 
 
 def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> dict[str, Any]:

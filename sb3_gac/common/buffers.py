@@ -155,8 +155,10 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         :param reward: shape (n_envs,)
         :param done: shape (n_envs,)
         :param infos: with "TimeLimit.truncated" where a time limit ended the episode
+        :raises ValueError: naming the entry that does not fit, see :meth:`ObservationLayout.pack`; nothing is then stored
         """
         rows, next_rows = self.layout.pack(obs, self.n_envs), self.layout.pack(next_obs, self.n_envs)
+        self._finals.forget_from(self._n_added * self.n_envs)
         if self._n_added:
             self._cut_what_does_not_continue(rows)
         for group, values in rows.items():
@@ -165,8 +167,8 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         self.rewards[self.pos] = reward
         self.endings[self.pos] = np.asarray(done, dtype=np.uint8) * DONE
         if self.handle_timeout_termination:
-            by_time_limit = [bool(info.get("TimeLimit.truncated", False)) for info in infos]
-            self.endings[self.pos] |= np.array(by_time_limit, dtype=np.uint8) * np.uint8(TIME_LIMIT)
+            by_time_limit = np.array([bool(info.get("TimeLimit.truncated", False)) for info in infos])
+            self.endings[self.pos] |= np.where(done, by_time_limit, False).astype(np.uint8) * np.uint8(TIME_LIMIT)
         self._keep_finals(np.flatnonzero(self.endings[self.pos]), next_rows, self._n_added)
 
         self._n_added += 1

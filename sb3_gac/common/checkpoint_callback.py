@@ -10,6 +10,7 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_gac.common.env_guard import EnvironmentFailedError
 from sb3_gac.common.resuming import ResumableAlgorithm
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -20,8 +21,9 @@ class ExactCheckpointCallback(BaseCallback):
     Calls :meth:`ResumableAlgorithm.save_checkpoint` where training can be taken up to the bit: before a rollout starts.
 
     On SIGTERM, as pre-empting schedulers send it, and on Ctrl-C the step is finished, a checkpoint made, and the process
-    ends with a message how to go on: ``SystemExit`` with status 143, or ``KeyboardInterrupt``. A checkpoint that can't be
-    written, on a full disk for example, is a warning: training goes on, and the checkpoint before stays.
+    ends with a message how to go on: ``SystemExit`` with status 143, or ``KeyboardInterrupt``. A second signal gets through
+    at once, for an environment may hang. A checkpoint that can't be written, on a full disk for example, is a warning:
+    training goes on, and the checkpoint before stays.
 
     :param directory: of the checkpoints
     :param every: environment steps between two of them
@@ -65,9 +67,24 @@ class ExactCheckpointCallback(BaseCallback):
         if self.on_signals and threading.current_thread() is threading.main_thread():
             self._handlers = {number: signal.signal(number, self._catch) for number in _SIGNALS}
             self.model.learn_scope.callback(self._release_signals)  # after an error as well
+            self.model.learn_scope.push(self._save_after_all)
 
     def _catch(self, number: int, frame: FrameType | None) -> None:
+        if self._caught is not None:
+            self._caught = None
+            self._release_signals()
+            signal.raise_signal(number)
+            return
         self._caught = number
+        name = signal.Signals(number).name
+        warnings.warn(
+            f"{name}: the step is finished and a checkpoint made. A second one ends the process at once.", stacklevel=2
+        )
+
+    def _save_after_all(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
+        """Ctrl-C in a terminal reaches the environments' processes as well, which end, so that the step can't be finished."""
+        if isinstance(error, EnvironmentFailedError) and self._caught is not None:
+            self._end_process(self._caught)
 
     def _on_rollout_start(self) -> None:
         if self._caught is not None:

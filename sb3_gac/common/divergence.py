@@ -63,7 +63,7 @@ def diagnose(
     :return: all of it that JSON can hold, with the largest absolute values in a batch as the networks see it
     """
     assert model.replay_buffer is not None
-    samples = model.replay_buffer.sample(model.batch_size, env=model._vec_normalize_env)
+    samples = model.replay_buffer.sample(model.batch_size, env=model.sampling_env)  # type: ignore[attr-defined]
     entries: Any = {**samples.observations, "reward": samples.rewards}  # type: ignore[dict-item]
     diagnosis = {
         "num_timesteps": model.num_timesteps,

@@ -1,9 +1,8 @@
 """What stands before vectorised environments: it names the environment that failed, before its values do harm."""
 
 import traceback
-from collections.abc import Callable
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
+from collections.abc import Callable, Sequence
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,12 +10,13 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_gac.common.checks import entries_of, fault_of, index_bounds, is_finite
+from sb3_gac.common.env_processes import KEPT, WatchedPipe, end_processes
+from sb3_gac.common.env_use import FINAL, EnvironmentUse, KeepingFinal, SuspiciousEnds
 
-KEPT = "Nothing of this step was stored, and all that was learned before is kept"
 GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
 GUARD = "_environment_guard"
-RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under "terminal_observation"
-PATIENCE = 2.0  # seconds that a process whose pipe has closed has to end
+TRUNCATED = "TimeLimit.truncated"  # SB3's name of an end by time limit in an info
+RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under FINAL
 
 
 class InvalidStepError(ValueError):
@@ -36,10 +36,22 @@ def guard_environments(env: VecEnv) -> None:
 
     :param env: gets a guard, unless it has one
     """
-    normalizer = unwrap_vec_normalize(env)
-    guarded = env if normalizer is None else normalizer.venv
+    guarded = _guarded(env)
     if GUARD not in vars(guarded):  # getattr would find that of an environment further in
         vars(guarded)[GUARD] = EnvironmentGuard(guarded)
+
+
+def guard_of(env: VecEnv) -> "EnvironmentGuard":
+    """
+    :param env: of :func:`guard_environments`
+    :return: its guard
+    """
+    return vars(_guarded(env))[GUARD]
+
+
+def _guarded(env: VecEnv) -> VecEnv:
+    normalizer = unwrap_vec_normalize(env)
+    return env if normalizer is None else normalizer.venv
 
 
 class EnvironmentGuard:
@@ -57,13 +69,27 @@ class EnvironmentGuard:
         self._entries = _entries_in(env.observation_space)
         self._base_entries = _entries_in(self.base.observation_space)
         self._failure: str | None = None
+        self._calls = 0
+        self._uses_inside: list[EnvironmentUse] = []
+        self._ends = SuspiciousEnds()
+        #: SB3's own return new arrays; of others, and of wrappers, it is not known
+        self._returns_new_arrays = type(env) in (DummyVecEnv, SubprocVecEnv)
         self._reset, self._step_async, self._step_wait = env.reset, env.step_async, env.step_wait
         vars(env).update(reset=self.reset, step_async=self.step_async, step_wait=self.step_wait)
-        if isinstance(self.base, DummyVecEnv) and "_save_obs" not in vars(self.base):
-            self._save_obs = self.base._save_obs
-            vars(self.base)["_save_obs"] = self.save_obs
-        if isinstance(self.base, SubprocVecEnv) and type(self.base.processes[0]).__name__ == "ForkProcess":
+        if isinstance(self.base, DummyVecEnv):
+            self._uses_inside = [EnvironmentUse.of(one) for one in self.base.envs]
+            if "_save_obs" not in vars(self.base):
+                self._save_obs = self.base._save_obs
+                vars(self.base)["_save_obs"] = self.save_obs
+                for index, one in enumerate(self.base.envs):
+                    KeepingFinal.of(one).add(self.base, index)
+        if isinstance(self.base, SubprocVecEnv) and not isinstance(self.base.remotes[0], WatchedPipe):
             self.base.remotes = tuple(map(WatchedPipe, self.base.remotes, self.base.processes))
+
+    @property
+    def uses(self) -> int:
+        """Steps and resets so far, of these vectorised environments or, in this process, of an environment in them."""
+        return self._calls + sum(use.count for use in self._uses_inside)
 
     # --- in the place of the environments' own ------------------------------------------------------------------------
 
@@ -73,7 +99,8 @@ class EnvironmentGuard:
         :raises InvalidStepError: if one does not fit its space or is not finite
         :raises EnvironmentFailedError: if an environment fails
         """
-        observation = self._call(self._reset)
+        self._calls += 1
+        observation = self._own(self._call(self._reset))
         self._check_observation(observation)
         return observation
 
@@ -89,7 +116,8 @@ class EnvironmentGuard:
                 f'The "action" of environment {np.argwhere(~finite)[0][0]} holds NaN or infinite values; no environment was '
                 "stepped. Check action_noise, if there is one; if not, the behaviour policy diverged: load an earlier state."
             )
-        self._call(self._step_async, actions)
+        self._calls += 1
+        self._call(self._step_async, actions.copy())  # an environment may write into what it gets
 
     def step_wait(self) -> Any:
         """
@@ -98,13 +126,12 @@ class EnvironmentGuard:
         :raises EnvironmentFailedError: if an environment fails
         """
         observation, rewards, dones, infos = self._call(self._step_wait)
+        observation = self._own(observation)
+        if not self._returns_new_arrays:
+            rewards, dones = np.array(rewards), np.array(dones)
         self._check_observation(observation)
         _check_rows('The "reward"', rewards, REWARD)
-        for index in np.flatnonzero(dones).tolist():
-            final = infos[index].get("terminal_observation")
-            if final is not None:
-                _check_entries(final, self._entries, index, "The last observation's entry")
-                infos[index][RAW_FINAL] = final
+        self._check_ends(observation, dones, infos)
         return observation, rewards, dones, infos
 
     def save_obs(self, index: int, observation: Any) -> None:
@@ -130,6 +157,31 @@ class EnvironmentGuard:
         for key, entry in self._entries.items():
             _check_rows(f'The observation\'s entry "{key}"', entries[key], entry)
 
+    def _check_ends(self, observation: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
+        """An info tells of an episode's end when there is one, and then of this one."""
+        for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
+            if done:
+                if FINAL not in info:
+                    raise InvalidStepError(
+                        f'The episode of environment {index} ended, but its info has no "{FINAL}"; the step was not stored, '
+                        "for the observation returned with it is the next episode's first. SB3's VecEnv has an episode's last "
+                        f'observation in infos[i]["{FINAL}"]: put it there before the environment is reset; {GO_ON}.'
+                    )
+                _check_entries(info[FINAL], self._entries, index, "The last observation's entry")
+                info[RAW_FINAL] = info[FINAL]
+            elif (FINAL in info or info.get(TRUNCATED)) and not _is_of_another(info, index, dones, infos):
+                for key in (FINAL, TRUNCATED, RAW_FINAL):  # left from an earlier end, in a dict that is used again
+                    info.pop(key, None)
+        if dones.any():
+            _check_own_infos(dones, infos)
+        self._ends.look_at(observation, dones, infos)
+
+    def _own(self, observation: Any) -> Any:
+        """Arrays that no later step changes."""
+        if self._returns_new_arrays:
+            return observation
+        return deepcopy(observation)
+
     # --- failures -----------------------------------------------------------------------------------------------------
 
     def _call(self, method: Callable[..., Any], *args: Any) -> Any:
@@ -148,7 +200,7 @@ class EnvironmentGuard:
     def _explained(self, error: Exception) -> Exception | None:
         """What to raise instead of an error that came out of an environment; ``None`` if it came from elsewhere."""
         if isinstance(self.base, SubprocVecEnv) and isinstance(error, (EOFError, OSError)):
-            self._failure = _end_processes(self.base)
+            self._failure = end_processes(self.base)
             return EnvironmentFailedError(self._failure)
         for frame, _ in traceback.walk_tb(error.__traceback__):  # SB3's own loops know which environment they are at
             if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
@@ -163,32 +215,6 @@ class EnvironmentGuard:
                     except InvalidStepError as fault:
                         return fault
         return None
-
-
-class WatchedPipe:
-    """
-    A pipe to a forked process. One that was forked earlier holds the far end open as well, so that a death does not show in
-    the pipe, and whoever waits for an answer would wait for ever.
-
-    :param pipe: to it
-    :param process: at its far end
-    """
-
-    def __init__(self, pipe: Connection, process: BaseProcess):
-        self._pipe, self._process = pipe, process
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._pipe, name)
-
-    def recv(self) -> Any:
-        """
-        :return: what the process sends
-        :raises EOFError: if it has died
-        """
-        while not self._pipe.poll(PATIENCE):
-            if not self._process.is_alive() and not self._pipe.poll():
-                raise EOFError
-        return self._pipe.recv()
 
 
 class Entry(NamedTuple):
@@ -274,24 +300,20 @@ def _message(name: str, index: int, fault: str) -> str:
     )
 
 
-def _end_processes(env: SubprocVecEnv) -> str:
-    """
-    Without one of its processes, such an environment can neither be stepped nor closed: the others would wait for ever.
+def _is_of_another(info: dict[str, Any], index: int, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> bool:
+    """Whether the info is the very dict of another environment, whose episode has ended."""
+    return any(infos[other] is info for other in np.flatnonzero(dones).tolist() if other != index)
 
-    :param env: of which a process has died
-    :return: which one, and what to do
+
+def _check_own_infos(dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
     """
-    wait([process.sentinel for process in env.processes], timeout=PATIENCE)
-    codes = {index: process.exitcode for index, process in enumerate(env.processes) if process.exitcode is not None}
-    for process, remote in zip(env.processes, env.remotes, strict=True):
-        process.terminate()
-        process.join(PATIENCE)
-        process.kill()
-        remote.close()
-    env.waiting, env.closed = False, True
-    dead = ", ".join(f"{index} (exit code {code})" for index, code in codes.items()) or "unknown"
-    return (
-        f"The process of environment {dead} died. An exit code of 1 is an exception, whose traceback stands above; a negative "
-        f"one a signal, such as -9 for lack of memory. {KEPT}: the other processes were ended, so give the model new "
-        "environments with set_env(...) and go on with learn(..., reset_num_timesteps=False)."
-    )
+    :raises InvalidStepError: if two environments whose episodes have ended have one info between them
+    """
+    ended = np.flatnonzero(dones).tolist()
+    for position, index in enumerate(ended):
+        for other in ended[:position]:
+            if infos[other] is infos[index]:
+                raise InvalidStepError(
+                    f"The episodes of environments {other} and {index} ended, but they share one info dict, which can hold "
+                    f'the "{FINAL}" of one of them only; the step was not stored. Return a dict for each environment; {GO_ON}.'
+                )

@@ -5,29 +5,21 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
-from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
 from sb3_gac.common.checks import check_same_spaces
-from sb3_gac.common.env_guard import FAULTS, guard_environments
+from sb3_gac.common.collecting import DataCollection
+from sb3_gac.common.env_guard import FAULTS
 
 
-class FaultTolerance(OffPolicyAlgorithm):
+class FaultTolerance(DataCollection):
     """
     Environments are guarded, see :mod:`sb3_gac.common.env_guard`; a fault ends the episode and costs nothing else.
 
     After one, the model can be saved, and ``learn(..., reset_num_timesteps=False)`` goes on from reset environments.
     """
-
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """Whatever environment the model is given comes through here."""
-        wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        guard_environments(wrapped)
-        return wrapped
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
@@ -38,6 +30,7 @@ class FaultTolerance(OffPolicyAlgorithm):
         env = self._wrap_env(env, self.verbose)
         _check_spaces(self, env, "environment")
         super().set_env(env, force_reset)
+        _ = self.replay_source  # which may refuse, or warn
 
     @classmethod
     def load(cls, path: Any, env: GymEnv | None = None, *args: Any, **kwargs: Any) -> Self:
@@ -87,7 +80,7 @@ class FaultTolerance(OffPolicyAlgorithm):
         """An error ends the episode: the next ``learn()`` resets the environments and keeps the rest."""
         try:
             yield
-        except Exception as error:
+        except BaseException as error:
             self._last_obs = None
             if isinstance(error, FAULTS):
                 error.args = (f"{error} It happened after {self.num_timesteps} steps (num_timesteps).",)

@@ -77,7 +77,14 @@ class Memory(nn.Module):
         :param episode_start: true where an episode starts, which is without a memory, shape (B,)
         :param batch: B
         :return: shape (1, B, S)
+        :raises ValueError: if ``state`` or ``episode_start`` is of another number of observations
         """
+        for name, given in (("state", state), ("episode_start", episode_start)):
+            if given is not None and len(given) != batch:
+                raise ValueError(
+                    f"{name} is of {len(given)} observations, but predict() was given {batch}: pass the state that the last "
+                    "predict() returned, and one episode_start for each observation."
+                )
         device = next(self.parameters()).device
         if state is None:
             return th.zeros(1, batch, self.state_size, device=device)

@@ -16,10 +16,14 @@ class ObservationLayout:
 
     :param space: of the observations
     :param float_dtype: how floating-point entries are stored, ``None`` for their own type
+    :raises ValueError: if that is no floating-point type
     """
 
     def __init__(self, space: spaces.Dict, float_dtype: np.dtype | None = None):
+        if float_dtype is not None and not np.issubdtype(float_dtype, np.floating):
+            raise ValueError(f'storage_dtype must be a floating-point type such as "float16", or None, got "{float_dtype}".')
         self.shapes: dict[str, tuple[int, ...]] = get_obs_shape(space)  # type: ignore[assignment]
+        self._given_shapes = {key: entry.shape or () for key, entry in space.spaces.items()}
         self.dtypes = {key: np.dtype(entry.dtype) for key, entry in space.spaces.items()}
         self.columns: dict[str, tuple[str, slice]] = {}
         self.widths: dict[str, int] = {}
@@ -46,10 +50,25 @@ class ObservationLayout:
         :param observation: ``n_rows`` of each entry
         :param n_rows: number of environments
         :return: storage type -> shape (n_rows, width)
+        :raises ValueError: naming the entry that is missing, unknown or of another shape, or that holds a number too large
+            for the type it is stored in
         """
+        if observation.keys() != self.columns.keys():
+            raise ValueError(
+                f"The replay buffer stores the entries {sorted(self.columns)}, but got an observation with "
+                f"{sorted(observation)}: pass it observations of its observation_space."
+            )
         rows = {group: np.empty((n_rows, width), dtype=group) for group, width in self.widths.items()}
         for key, (group, columns) in self.columns.items():
-            rows[group][:, columns] = np.reshape(observation[key], (n_rows, -1))
+            values = np.asarray(observation[key])
+            if values.shape not in ((n_rows, *self.shapes[key]), (n_rows, *self._given_shapes[key])):
+                raise ValueError(
+                    f'The replay buffer stores entry "{key}" in the shape {(n_rows, *self.shapes[key])}, environments first, '
+                    f"but got {values.shape}: pass it observations of its observation_space."
+                )
+            if group != values.dtype.name:
+                _check_range(key, values, np.dtype(group))
+            rows[group][:, columns] = values.reshape(n_rows, -1)
         return rows
 
     def unpack(self, rows: Rows) -> dict[str, np.ndarray]:
@@ -62,6 +81,22 @@ class ObservationLayout:
             values = rows[group][..., columns].astype(self.dtypes[key], copy=False)
             observation[key] = values.reshape(*values.shape[:-1], *self.shapes[key])
         return observation
+
+
+def _check_range(key: str, values: np.ndarray, stored: np.dtype) -> None:
+    """
+    :raises ValueError: if one of the values is infinite in the type that it is to be stored in
+    """
+    if stored.kind != "f" or np.can_cast(values.dtype, stored):
+        return
+    largest = np.finfo(stored).max
+    too_large = np.abs(values) > largest
+    if too_large.any():
+        raise ValueError(
+            f'Entry "{key}" holds {values[too_large][0]:g}, but with replay_buffer_kwargs={{"storage_dtype": "{stored}"}} the '
+            f"replay buffer holds numbers up to {largest:g}: leave storage_dtype out, or scale the entry in the environment. "
+            "The step was not stored."
+        )
 
 
 class FinalObservations:
@@ -117,6 +152,13 @@ class FinalObservations:
         :param time: whatever was appended with an earlier time is not needed any more
         """
         self._first += int(np.searchsorted(self._times[self._first : self._end], time))
+
+    def forget_from(self, time: int) -> None:
+        """
+        :param time: whatever was appended with it or a later one does not count: it is of a step whose storing was
+            interrupted
+        """
+        self._end = self._first + int(np.searchsorted(self._times[self._first : self._end], time))
 
     def replace_in(self, rows: Rows, positions: np.ndarray, times: np.ndarray) -> None:
         """

@@ -15,7 +15,6 @@ from typing_extensions import Self
 from sb3_gac.common.arguments import check_shared_arguments, check_what_construction_needs
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
-from sb3_gac.common.env_guard import RAW_FINAL
 from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_sequences
 from sb3_gac.common.guard import DeploymentGuard
 from sb3_gac.common.heads import check_action_space, resolve_target_entropy
@@ -177,6 +176,8 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         self._setup_coefficients()
         self.programs = {}
         self._behaviour_state: BehaviourState = None
+        if self.env is not None:
+            _ = self.replay_source  # which may refuse, or warn
 
     def _check_arguments(self) -> None:
         """
@@ -272,28 +273,6 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         :param action: in [-1, 1], or one of a number
         """
         return self.policy.unscale_action(action) if isinstance(self.action_space, spaces.Box) else action
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        self._last_episode_starts = dones
-        finals = {index: infos[index].get(RAW_FINAL) for index in np.flatnonzero(dones)}
-        if self._vec_normalize_env is None or None in finals.values():
-            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-            return
-        # SB3 would take an episode's last observation from VecNormalize and undo that, which leaves it clipped and rounded
-        next_obs, raw_reward = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
-        for index, final in finals.items():
-            for key, values in next_obs.items():  # type: ignore[union-attr]
-                values[index] = final[key]  # type: ignore[index]
-        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, raw_reward, dones, infos)  # type: ignore[arg-type]
-        self._last_obs, self._last_original_obs = new_obs, self._vec_normalize_env.get_original_obs()
 
     def learn(
         self,

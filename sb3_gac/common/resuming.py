@@ -39,6 +39,8 @@ PROGRESS = (
     "_total_timesteps",
     "_num_timesteps_at_start",
     "_episode_num",
+    "_rollout_steps",
+    "_rollout_episodes",
     "_n_updates",
     "_current_progress_remaining",
     "_last_obs",
@@ -261,6 +263,7 @@ class ResumableAlgorithm(NetworkTraining):
             warnings.warn(f"New episodes start, since those of the checkpoint can't be gone on with: {why}.", stacklevel=4)
             self._last_obs = None
             self.env.seed(int(generators["numpy"][1][0]) % 2**31)  # the same for the same checkpoint
+        self._note_use()
 
     def _restore_generators(self, states: dict[str, Any]) -> None:
         """Last: whatever else is restored may draw random numbers."""
@@ -284,9 +287,7 @@ class ResumableAlgorithm(NetworkTraining):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, Any]:
-        """Episodes do not go on across a reset; SB3 resets the action noise at each ``learn``, but a resumed one goes on."""
-        if (reset_num_timesteps or self._last_obs is None) and isinstance(self.replay_buffer, CompactDictReplayBuffer):
-            self.replay_buffer.cut()  # the environments are about to be reset
+        """SB3 resets the action noise at each ``learn``, but a resumed one goes on."""
         noise, self._resumed_noise = deepcopy(self._resumed_noise), None
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if noise is not None and not reset_num_timesteps:

@@ -250,7 +250,7 @@ class NetworkTraining(FaultTolerance):
 
     def _sample_batch(self, batch_size: int) -> Batch:
         assert self.replay_buffer is not None
-        samples = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+        samples = self.replay_buffer.sample(batch_size, env=self.sampling_env)
         discounts = getattr(samples, "discounts", None)
         if discounts is None:
             discounts = th.full((), self.gamma, device=self.device)

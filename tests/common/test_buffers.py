@@ -12,6 +12,7 @@ from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac.common.buffers import CompactDictReplayBuffer
+from sb3_gac.common.episodes import EpisodeReplayBuffer
 from tests.helpers import TwoViewBandit, small_model
 
 SPACE = spaces.Dict(
@@ -339,3 +340,107 @@ def test_memory_is_exactly_linear_in_the_capacity():
     per_transition = 4 * (3 + 5 + 2 + 1) + 1
     assert two - one == 1_000 * per_transition
     assert four - two == 2_000 * per_transition
+
+
+# --- what does not fit -----------------------------------------------------------------------------------------------------
+
+ODD_SPACE = spaces.Dict(
+    partial=spaces.Box(-1e9, 1e9, (2, 3), np.float32), gear=spaces.Discrete(4), ticks=spaces.Box(-1e9, 1e9, (6,), np.float64)
+)
+
+
+def _odd_observation(n_envs=2, **changed):
+    entries = {
+        "partial": np.ones((n_envs, 2, 3), np.float32),
+        "gear": np.zeros(n_envs, np.int64),
+        "ticks": np.ones((n_envs, 6)),
+    }
+    return {key: value for key, value in {**entries, **changed}.items() if value is not None}
+
+
+def _add_pair(buffer, obs, next_obs):
+    buffer.add(obs, next_obs, np.zeros((2, 1)), np.zeros(2), np.zeros(2, bool), [{}, {}])
+
+
+@pytest.mark.parametrize("kind", [CompactDictReplayBuffer, EpisodeReplayBuffer])
+@pytest.mark.parametrize("which", ["obs", "next_obs"])
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"partial": np.ones((2, 3, 2), np.float32)}, r'entry "partial" in the shape \(2, 2, 3\).*got \(2, 3, 2\)'),
+        ({"partial": np.ones((2, 6), np.float32)}, r'entry "partial" in the shape \(2, 2, 3\).*got \(2, 6\)'),
+        ({"partial": np.ones((2, 3, 2, 3), np.float32)}, r'entry "partial" in the shape'),
+        ({"ticks": np.ones((6, 2))}, r'entry "ticks" in the shape \(2, 6\).*got \(6, 2\)'),
+        ({"ticks": np.ones((2, 3))}, r'entry "ticks" in the shape'),
+        ({"ticks": np.ones((1, 12))}, r'entry "ticks" in the shape'),
+        ({"gear": np.zeros((2, 2), np.int64)}, r'entry "gear" in the shape'),
+        (
+            {"gear": None},
+            r"stores the entries \['gear', 'partial', 'ticks'\], but got an observation with \['partial', 'ticks'\]",
+        ),
+        ({"camera": np.zeros((2, 3))}, r"got an observation with \['camera', "),
+    ],
+)
+def test_what_has_another_shape_or_name_is_not_reshaped_until_it_fits(kind, which, changed, said):
+    buffer = kind(20, ODD_SPACE, spaces.Box(-1, 1, (1,)), "cpu", n_envs=2)
+    _add_pair(buffer, _odd_observation(), _odd_observation())
+    before = {name: array.copy() for name, array in buffer.rows_by_name().items()}
+    pair = {"obs": _odd_observation(), "next_obs": _odd_observation(), which: _odd_observation(**changed)}
+    with pytest.raises(ValueError, match=said):
+        _add_pair(buffer, **pair)
+    assert buffer.pos == 1
+    for name, array in buffer.rows_by_name().items():
+        np.testing.assert_array_equal(array, before[name])
+    _add_pair(buffer, _odd_observation(gear=np.zeros((2, 1), np.int64)), _odd_observation())
+    assert buffer.pos == 2
+
+
+@pytest.mark.parametrize("key", ["partial", "ticks"])
+@pytest.mark.parametrize("value", [65_520.0, -1e6, np.float32(3e38), 70_000])
+def test_what_float16_cannot_hold_is_refused_by_name(key, value):
+    buffer = CompactDictReplayBuffer(20, ODD_SPACE, spaces.Box(-1, 1, (1,)), "cpu", n_envs=2, storage_dtype="float16")
+    largest = {name: entry.copy() for name, entry in _odd_observation().items()}
+    largest[key].flat[3] = -65_504.0
+    _add_pair(buffer, largest, largest)
+    too_large = _odd_observation()
+    too_large[key] = too_large[key].astype(type(value) if isinstance(value, int) else too_large[key].dtype)
+    too_large[key].flat[3] = value
+    with pytest.raises(ValueError, match=rf'"{key}" holds .*replay_buffer_kwargs=.*"storage_dtype": "float16".*up to 65504'):
+        _add_pair(buffer, largest, too_large)
+    assert buffer.pos == 1
+    assert np.isfinite(buffer.observations[key]).all()
+
+
+def test_counted_entries_are_not_stored_in_float16():
+    buffer = CompactDictReplayBuffer(20, ODD_SPACE, spaces.Box(-1, 1, (1,)), "cpu", n_envs=2, storage_dtype="float16")
+    _add_pair(buffer, _odd_observation(gear=np.array([3, 1])), _odd_observation())
+    np.testing.assert_array_equal(buffer.observations["gear"][0].ravel(), [3, 1])
+
+
+def test_a_storage_dtype_that_is_none():
+    with pytest.raises(ValueError, match='storage_dtype must be a floating-point type such as "float16", or None, got "int8"'):
+        CompactDictReplayBuffer(20, ODD_SPACE, spaces.Box(-1, 1, (1,)), "cpu", storage_dtype="int8")
+
+
+@pytest.mark.parametrize("kind", [CompactDictReplayBuffer, EpisodeReplayBuffer])
+def test_a_step_whose_storing_was_interrupted_is_as_if_it_had_not_been(kind, monkeypatch):
+    """An interrupt comes between any two lines: here, after an episode's last observation was kept."""
+    buffer = kind(20, ODD_SPACE, spaces.Box(-1, 1, (1,)), "cpu", n_envs=2)
+    a, b, c, d = (_odd_observation(ticks=np.full((2, 6), float(number))) for number in range(4))
+    _add_pair(buffer, a, b)
+    monkeypatch.setattr(buffer, "_keep_finals", _then_interrupt(buffer._keep_finals))
+    with pytest.raises(KeyboardInterrupt):
+        buffer.add(b, c, np.zeros((2, 1)), np.zeros(2), np.ones(2, bool), [{}, {}])
+    monkeypatch.undo()
+    buffer.cut()
+    buffer.add(c, d, np.zeros((2, 1)), np.zeros(2), np.ones(2, bool), [{}, {}])
+    assert buffer.pos == 2
+    np.testing.assert_array_equal(buffer.next_observations["ticks"][:2, 0, 0], [1.0, 3.0])
+
+
+def _then_interrupt(method):
+    def interrupted(*args):
+        method(*args)
+        raise KeyboardInterrupt
+
+    return interrupted

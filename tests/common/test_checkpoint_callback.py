@@ -1,11 +1,13 @@
 """Checkpoints on a schedule and on signals."""
 
+import os
 import signal
 import subprocess
 import sys
 
 import pytest
 from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_gac import GAC, DivergenceError, ExactCheckpointCallback
 from sb3_gac.common.checkpoint_files import checkpoints, step_of
@@ -105,3 +107,47 @@ def test_diverged_training_leaves_the_last_good_checkpoint(tmp_path):
     assert max(_steps(tmp_path)) == 40
     resumed = GAC.resume(tmp_path, TwoViewBandit(length=5), device="cpu")
     assert all(bool(value.isfinite().all()) for value in resumed.get_parameters()["policy"].values())
+
+
+class _Hanging(TwoViewBandit):
+    """Tells that it hangs, and does, until it is interrupted."""
+
+    def step(self, action):
+        os.kill(os.getpid(), signal.SIGINT)
+        self.hung = True
+        os.kill(os.getpid(), signal.SIGINT)
+        raise AssertionError("the second interrupt was kept")
+
+
+def test_a_second_interrupt_gets_through_at_once(tmp_path):
+    """In the middle of a step, which may never end; what was stored stays, and the next learn starts from a reset."""
+    env = _Hanging()
+    model = small_model(env)
+    with pytest.warns(UserWarning, match="SIGINT: the step is finished.*second one ends"), pytest.raises(KeyboardInterrupt):
+        model.learn(100, callback=ExactCheckpointCallback(tmp_path, every=30))
+    assert env.hung
+    assert (_steps(tmp_path), model._last_obs) == ([], None)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+class _TellingAll(TwoViewBandit):
+    """Sends Ctrl-C as a terminal does: to the process that trains and to its own."""
+
+    def step(self, action):
+        self._step_count = getattr(self, "_step_count", 0) + 1
+        if self._step_count == 15:
+            os.kill(os.getppid(), signal.SIGINT)
+            raise KeyboardInterrupt
+        return super().step(action)
+
+
+@pytest.mark.filterwarnings("ignore:SIGINT")
+def test_ctrl_c_in_a_terminal_ends_the_environments_too_and_makes_a_checkpoint(tmp_path):
+    env = SubprocVecEnv([_TellingAll, TwoViewBandit], start_method="fork")
+    model = small_model(env)
+    with pytest.raises(KeyboardInterrupt, match="the checkpoint after 28 steps is in"):
+        model.learn(100, callback=ExactCheckpointCallback(tmp_path, every=1000))
+    assert _steps(tmp_path) == [28]
+    with pytest.warns(UserWarning, match="New episodes start"):
+        resumed = GAC.resume(tmp_path, DummyVecEnv([TwoViewBandit] * 2), device="cpu")
+    assert resumed.learn(8, reset_num_timesteps=False).replay_buffer.pos == 18

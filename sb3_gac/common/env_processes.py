@@ -1,0 +1,100 @@
+"""Environments in other processes: answers that belong to their requests, and processes that die."""
+
+from collections.abc import Callable
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+KEPT = "Nothing of this step was stored, and all that was learned before is kept"
+PATIENCE = 2.0  # seconds that a process whose pipe has closed has to end
+
+
+class WatchedPipe:
+    """
+    A pipe to a process, each of whose answers belongs to the request before it.
+
+    An interrupt between the two leaves an answer that nobody has fetched: it is thrown away before the next request, or all
+    later ones would be those to earlier requests. One within a message leaves a pipe that can't be used any more. And a
+    process that was forked earlier holds the far end open as well, so that a death does not show in the pipe, and whoever
+    waits for an answer would wait for ever.
+
+    :param pipe: to it
+    :param process: at its far end
+    """
+
+    def __init__(self, pipe: Connection, process: BaseProcess):
+        self._pipe, self._process = pipe, process
+        self._awaits_answer = False
+        #: Whether a message is under way, or was when an interrupt came
+        self.torn = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._pipe, name)
+
+    def send(self, request: Any) -> None:
+        """
+        :param request: to the process, which answers each but the last, "close"
+        :raises EOFError: if it has died, or an exchange with it was interrupted within a message
+        """
+        if self._awaits_answer:
+            self.recv()
+        self._exchange(self._pipe.send, request)
+        self._awaits_answer = True
+
+    def recv(self) -> Any:
+        """
+        :return: what the process sends; ``None`` if that was fetched before
+        :raises EOFError: if it has died, or an exchange with it was interrupted within a message
+        """
+        if not self._awaits_answer:
+            return None
+        while not self._pipe.poll(PATIENCE):
+            if not self._process.is_alive() and not self._pipe.poll():
+                raise EOFError
+        answer = self._exchange(self._pipe.recv)
+        self._awaits_answer = False
+        return answer
+
+    def _exchange(self, method: Callable[..., Any], *args: Any) -> Any:
+        if self.torn:
+            raise EOFError
+        self.torn = True
+        try:
+            result = method(*args)
+        except Exception:  # the process has died, or the whole message was read and can't be understood
+            self.torn = False
+            raise
+        self.torn = False
+        return result
+
+
+def end_processes(env: SubprocVecEnv) -> str:
+    """
+    Without one of its processes, such an environment can neither be stepped nor closed: the others would wait for ever.
+
+    :param env: of which a process has died, or an exchange with it was interrupted within a message
+    :return: which one, and what to do
+    """
+    torn = [index for index, remote in enumerate(env.remotes) if getattr(remote, "torn", False)]
+    if not torn:
+        wait([process.sentinel for process in env.processes], timeout=PATIENCE)
+    codes = {index: process.exitcode for index, process in enumerate(env.processes) if process.exitcode is not None}
+    for process, remote in zip(env.processes, env.remotes, strict=True):
+        process.terminate()
+        process.join(PATIENCE)
+        process.kill()
+        remote.close()
+    env.waiting, env.closed = False, True
+    others = (
+        f"{KEPT}: the other processes were ended, so give the model new environments with set_env(...) and go on with "
+        "learn(..., reset_num_timesteps=False)."
+    )
+    if torn and not codes:
+        return f"The process of environment {torn[0]} was interrupted within a message and makes no sense any more. {others}"
+    dead = ", ".join(f"{index} (exit code {code})" for index, code in codes.items()) or "unknown"
+    return (
+        f"The process of environment {dead} died. An exit code of 1 is an exception, whose traceback stands above; a negative "
+        f"one a signal, such as -9 for lack of memory; one of 0 after an interrupt, which ends all of them. {others}"
+    )
