@@ -159,6 +159,10 @@ class EnvironmentGuard:
 
     def _check_ends(self, observation: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
         """An info tells of an episode's end when there is one, and then of this one."""
+        if len(infos) != len(dones):
+            raise InvalidStepError(
+                f"{len(dones)} environments returned {len(infos)} info dicts; the step was not stored. Return one for each; {GO_ON}."
+            )
         for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
             if done:
                 if FINAL not in info:

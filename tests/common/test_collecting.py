@@ -459,6 +459,16 @@ def test_an_end_without_its_observation_is_named(cls, policy, buffer, normalized
     assert_true_and_whole(model, diary, but=2)
 
 
+def test_as_many_infos_as_environments():
+    class Fewer(_Infos):
+        def step_wait(self):
+            observation, rewards, dones, infos = self.venv.step_wait()
+            return observation, rewards, dones, infos[:1]
+
+    with pytest.raises(InvalidStepError, match="2 environments returned 1 info dicts"):
+        _model(Fewer(Diary().envs(2), "")).learn(4)
+
+
 class _Mixed(DiaryEnv):
     """Every other episode runs into its time limit, and the others terminate."""
 

@@ -130,7 +130,7 @@ def test_checkpoints_hold_replay_buffer_and_vec_normalize(tmp_path):
     loaded.load_replay_buffer(tmp_path / "rl_model_replay_buffer_40_steps.pkl")
     loaded.learn(40, reset_num_timesteps=False)
     assert loaded.num_timesteps == 80
-    assert loaded.replay_buffer.pos == 79  # the checkpoint was written before its step was stored
+    assert loaded.replay_buffer.pos == 80  # with the step that the checkpoint was written after
 
 
 def test_children_know_their_evaluation(tmp_path):
