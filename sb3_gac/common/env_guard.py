@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_gac.common.checks import entries_of, fault_of, index_bounds, is_finite
+from sb3_gac.common.checks import described, entries_of, fault_of, index_bounds, is_finite
 
 KEPT = "Nothing of this step was stored, and all that was learned before is kept"
 GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
@@ -153,7 +153,7 @@ class EnvironmentGuard:
         for frame, _ in traceback.walk_tb(error.__traceback__):  # SB3's own loops know which environment they are at
             if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
                 return EnvironmentFailedError(
-                    f"Environment {frame.f_locals['env_idx']} raised {type(error).__name__}: {error} {KEPT}: mend the "
+                    f"Environment {frame.f_locals['env_idx']} raised {described(error)} {KEPT}: mend the "
                     f"environment; {GO_ON}, or set_env(...) first gives the model another one."
                 )
             if frame.f_code.co_name == "_stack_obs":

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
-from sb3_gac.common.checks import check_same_spaces
+from sb3_gac.common.checks import as_sentence, check_same_spaces
 from sb3_gac.common.env_guard import FAULTS, guard_environments
 
 
@@ -90,7 +90,7 @@ class FaultTolerance(OffPolicyAlgorithm):
         except Exception as error:
             self._last_obs = None
             if isinstance(error, FAULTS):
-                error.args = (f"{error} It happened after {self.num_timesteps} steps (num_timesteps).",)
+                error.args = (f"{as_sentence(error)} It happened after {self.num_timesteps} steps (num_timesteps).",)
             raise
 
 
