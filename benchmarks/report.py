@@ -117,8 +117,9 @@ def interactive(tidy: pd.DataFrame) -> graph_objects.Figure:
         for column, task in enumerate(tasks, start=1):
             cell = tidy[(tidy.task == task) & (tidy.noise == noise)]
             if cell.empty:
-                middle = {"xref": "x domain", "yref": "y domain", "x": 0.5, "y": 0.5, "showarrow": False}
-                figure.add_annotation(text=NOT_RUN, row=row, col=column, **middle)
+                place = figure.get_subplot(row, column)  # whose axes no note can refer to, for nothing is drawn in it
+                x, y = (sum(axis.domain) / 2 for axis in (place.xaxis, place.yaxis))
+                figure.add_annotation(text=NOT_RUN, x=x, y=y, xref="paper", yref="paper", showarrow=False)
                 figure.update_xaxes(visible=False, row=row, col=column)
                 figure.update_yaxes(visible=False, row=row, col=column)
             for algorithm, color in palette(algorithms).items():
