@@ -1,1 +1,16 @@
 """Programs that run algorithms on tasks and compare them. They meet only in files, and use public names of sb3_gac."""
+
+from importlib.util import find_spec
+
+_EXTRA = ("pandas", "plotly", "rliable", "tensorboard")
+
+
+def _lacks(name: str) -> bool:
+    try:
+        return find_spec(name) is None
+    except ImportError:
+        return True
+
+
+if _missing := [name for name in _EXTRA if _lacks(name)]:
+    raise ImportError(f'The benchmarks need {", ".join(_missing)}: pip install -e ".[benchmarks]" installs them.')

@@ -24,6 +24,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#7f7f7f")
+STEPS, RETURN, NOT_RUN = "environment steps", "return", "not run yet"
 _SHOWN_ELSEWHERE = ("cells", "normalised_iqm", "probability_of_improvement", "runs")
 STYLE = """
 body {font: 15px sans-serif; margin: 2em}
@@ -90,10 +91,10 @@ def draw(tidy: pd.DataFrame, path: Path) -> None:
                 if has_guider(group):
                     guider = curves(group, "guider")
                     axis.plot(guider.index, guider["mean"], color=color, linestyle="--", linewidth=1)
-            axis.set(title=f"{task}, noise {noise:g}", xlabel="environment steps", ylabel="return")
+            axis.set(title=f"{task}, noise {noise:g}", xlabel=STEPS, ylabel=RETURN)
             if cell.empty:
                 axis.set_axis_off()
-                axis.text(0.5, 0.5, "not run yet", ha="center", transform=axis.transAxes)
+                axis.text(0.5, 0.5, NOT_RUN, ha="center", transform=axis.transAxes)
     shown = next(axis for axis in axes.flat if axis.get_legend_handles_labels()[0])
     shown.legend(fontsize="small")
     figure.savefig(path, dpi=110)
@@ -107,35 +108,53 @@ def interactive(tidy: pd.DataFrame) -> graph_objects.Figure:
     """
     tasks, noises, algorithms = grid(tidy)
     titles = [f"{task}, noise {noise:g}" for noise in noises for task in tasks]
-    figure = make_subplots(rows=len(noises), cols=len(tasks), subplot_titles=titles)
+    gap = {"vertical_spacing": 0.3 / len(noises), "horizontal_spacing": 0.25 / len(tasks)}  # where names of axes go
+    figure = make_subplots(rows=len(noises), cols=len(tasks), subplot_titles=titles, **gap)
+    figure.update_xaxes(title_text=STEPS)
+    figure.update_yaxes(title_text=RETURN)
     named: set[str] = set()
     for row, noise in enumerate(noises, start=1):
         for column, task in enumerate(tasks, start=1):
             cell = tidy[(tidy.task == task) & (tidy.noise == noise)]
+            if cell.empty:
+                place = figure.get_subplot(row, column)  # whose axes no note can refer to, for nothing is drawn in it
+                x, y = (sum(axis.domain) / 2 for axis in (place.xaxis, place.yaxis))
+                figure.add_annotation(text=NOT_RUN, x=x, y=y, xref="paper", yref="paper", showarrow=False)
+                figure.update_xaxes(visible=False, row=row, col=column)
+                figure.update_yaxes(visible=False, row=row, col=column)
             for algorithm, color in palette(algorithms).items():
                 group = cell[cell.algorithm == algorithm]
                 if not group.empty:
-                    lines = algorithm_lines(group, algorithm, color, in_legend=algorithm not in named)
+                    lines = algorithm_lines(group, algorithm, color)
+                    for line in lines:
+                        line.showlegend = line.name in (algorithm, guider_of(algorithm)) and line.name not in named
+                    named.update(line.name for line in lines)
                     figure.add_traces(lines, rows=row, cols=column)
-                    named.add(algorithm)
     figure.update_layout(
         height=340 * len(noises) + 80, hovermode="closest", hoverlabel={"namelength": -1}, template="plotly_white"
     )
     return figure
 
 
-def algorithm_lines(group: pd.DataFrame, algorithm: str, color: str, in_legend: bool) -> list[graph_objects.Scatter]:
+def guider_of(algorithm: str) -> str:
+    """
+    :param algorithm: its name
+    :return: that of its guider's curve
+    """
+    return f"{algorithm}, guider"
+
+
+def algorithm_lines(group: pd.DataFrame, algorithm: str, color: str) -> list[graph_objects.Scatter]:
     """
     :param group: one algorithm in one cell
     :param algorithm: its name
     :param color: its color
-    :param in_legend: whether this cell's mean stands in the legend for those of all cells
     :return: each seed's curve, the interval around the mean as a band, the mean, and the guider's mean in dashes
     """
 
-    def line(x: Any, y: Any, name: str, showlegend: bool = False, **style: Any) -> graph_objects.Scatter:
+    def line(x: Any, y: Any, name: str, **style: Any) -> graph_objects.Scatter:
         style = {"mode": "lines", "line": {"color": color}, **style}
-        return graph_objects.Scatter(x=x, y=y, name=name, legendgroup=algorithm, showlegend=showlegend, **style)
+        return graph_objects.Scatter(x=x, y=y, name=name, legendgroup=algorithm, **style)
 
     thin: dict[str, Any] = {
         "mode": "lines+markers",
@@ -148,10 +167,10 @@ def algorithm_lines(group: pd.DataFrame, algorithm: str, color: str, in_legend: 
     there, back = list(learner.index), list(learner.index[::-1])
     band: dict[str, Any] = {"fill": "toself", "line": {"color": color, "width": 0}, "opacity": 0.15, "hoverinfo": "skip"}
     lines.append(line(there + back, [*learner.high, *learner.low[::-1]], f"{algorithm}, 95% of the mean", **band))
-    lines.append(line(learner.index, learner["mean"], algorithm, in_legend))
+    lines.append(line(learner.index, learner["mean"], algorithm))
     if has_guider(group):
         guider = curves(group, "guider")["mean"]
-        lines.append(line(guider.index, guider, f"{algorithm}, guider", line={"color": color, "width": 1, "dash": "dash"}))
+        lines.append(line(guider.index, guider, guider_of(algorithm), line={"color": color, "width": 1, "dash": "dash"}))
     return lines
 
 

@@ -118,6 +118,7 @@ def export_learner(
     :return: the path
     :raises ValueError: if the suffix is another, there is nothing to verify on, a unit is that of something else, or the
         model learned under a ``VecNormalize`` that it does not have any more
+    :raises ImportError: if a file for ONNX is wanted, and onnx or onnxruntime is not installed
     :raises sb3_gac.verification.ExportError: if the file's actions are not those of ``predict``; nothing is then written
     """
     path = Path(path)
@@ -211,7 +212,11 @@ def _example(module: DeployedModule) -> tuple[th.Tensor, ...]:
 
 
 def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
-    import onnx
+    try:
+        import onnx
+        import onnxruntime  # noqa: F401, with which the file is compared
+    except ImportError as error:
+        raise ImportError(f'A file for ONNX needs onnx and onnxruntime: pip install "sb3_gac[export]" ({error}).') from error
 
     remembers = module.memory is not None
     inputs = [*module.keys, *[module.state_name] * remembers]

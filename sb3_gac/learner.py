@@ -13,7 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
+
+try:
+    import onnxruntime
+except ImportError as error:
+    raise ImportError(
+        'sb3_gac.learner needs onnxruntime: pip install onnxruntime on the robot, "sb3_gac[export]" where models are trained.'
+    ) from error
 
 METADATA_KEY = "sb3_gac"
 

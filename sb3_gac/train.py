@@ -4,11 +4,16 @@ Train GAC on a noisy MuJoCo task, then evaluate the learner on its partial obser
     python -m sb3_gac.train --task HalfCheetah --noise 0.1 --steps 50000 --seed 0
 
 Everything is saved under ``runs/``: the model, the learning curve as a picture, the evaluations and the resolved
-configuration.
+configuration.  A run that was stopped, by Ctrl-C or otherwise, goes on from its last checkpoint, and ends as it would have
+without that::
+
+    python -m sb3_gac.train --resume runs/<its directory>
 """
 
 import argparse
 import json
+import shutil
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -22,11 +27,14 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_gac import GAC, PRESETS, GuiderLearnerEvalCallback, __version__, preset
+from sb3_gac import GAC, PRESETS, ExactCheckpointCallback, GuiderLearnerEvalCallback, __version__, preset
+from sb3_gac.common.checkpoint_files import checkpoints
 from sb3_gac.envs import PARTIAL
 from sb3_gac.envs.mujoco import TASKS
 
 EVAL_SEED = 10_000
+EVALUATIONS = 10
+CONFIGURATION, CHECKPOINTS, RESULTS = "config.yaml", "checkpoints", "results.json"
 
 
 class PartialOnly:
@@ -78,9 +86,31 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--episodes", type=int, default=10, help="of each evaluation")
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where results go")
+    parser.add_argument("--resume", type=Path, metavar="DIRECTORY", help="of a run to go on with, whose options count")
     options = parser.parse_args(arguments)
+    if options.resume is not None:
+        try:
+            return options_of(options.resume)
+        except ValueError as error:
+            parser.error(str(error))
     options.envs = options.envs or PRESETS[options.preset].envs
     return options
+
+
+def options_of(directory: Path) -> argparse.Namespace:
+    """
+    :param directory: of a run that was stopped
+    :return: its options, to go on with it
+    :raises ValueError: if there is nothing to go on with
+    """
+    if (directory / RESULTS).exists():
+        raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
+    if not checkpoints(directory / CHECKPOINTS):
+        raise ValueError(f"--resume {directory}: there is no checkpoint in {directory / CHECKPOINTS}; start the run again.")
+    names = vars(parse_arguments([]))
+    configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
+    options = {name: configuration[name] for name in names if name != "resume"}
+    return argparse.Namespace(**options | {"runs": Path(options["runs"]), "resume": directory})
 
 
 def gac_arguments(options: argparse.Namespace) -> dict[str, Any]:
@@ -135,44 +165,41 @@ def draw_learning_curve(history: list[dict[str, float]], title: str, path: Path)
 
 def resolved_configuration(options: argparse.Namespace, arguments: dict[str, Any]) -> dict[str, Any]:
     """All that it takes to repeat the run."""
-    command_line = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
+    given = {name: value for name, value in vars(options).items() if name != "resume"}
+    command_line = {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
     versions = {"sb3_gac": __version__, "torch": str(th.__version__)}
     shown = {**arguments, "policy_kwargs": {key: str(value) for key, value in arguments["policy_kwargs"].items()}}
     return {**command_line, "eval_seed": EVAL_SEED, "gac": shown, "versions": versions}
 
 
-def train(options: argparse.Namespace) -> Path:
+def start(options: argparse.Namespace) -> Path:
     """
-    The main job.
-
     :param options: see :func:`parse_arguments`
-    :return: directory with everything that was saved
+    :return: a new directory for the run, with its configuration
     """
     name = f"{options.task}-noise{options.noise:g}-seed{options.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     directory = options.runs / name
     directory.mkdir(parents=True)
+    configuration = resolved_configuration(options, gac_arguments(options))
+    (directory / CONFIGURATION).write_text(yaml.safe_dump(configuration, sort_keys=False))
+    return directory
+
+
+def train(options: argparse.Namespace, directory: Path) -> None:
+    """
+    The main job, or what is left of it.
+
+    :param options: see :func:`parse_arguments`
+    :param directory: where everything is saved, see :func:`start`
+    """
     set_random_seed(options.seed)
     env_kwargs = {"noise_std": options.noise, "privileged": options.privileged}
     env_id = f"sb3_gac/{options.task}-v5"
     env = make_vec_env(env_id, n_envs=options.envs, seed=options.seed, env_kwargs=env_kwargs)
     eval_env = make_vec_env(env_id, n_envs=min(5, options.episodes), env_kwargs=env_kwargs)
-    arguments = gac_arguments(options)
-    configuration = resolved_configuration(options, arguments)
-    (directory / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False))
-
-    started = time.time()
-    model = GAC("MultiInputPolicy", env, seed=options.seed, **arguments)
-    callback = GuiderLearnerEvalCallback(
-        eval_env,
-        eval_seed=EVAL_SEED,
-        eval_freq=max(options.steps // 10 // options.envs, 1),
-        n_eval_episodes=options.episodes,
-        verbose=0,
-    )
-    model.learn(options.steps, callback=callback, progress_bar=True)
-    minutes = (time.time() - started) / 60
+    model, history, minutes = learn(options, directory, env, eval_env)
     model.save(directory / "model")
-    draw_learning_curve(callback.history, f"{options.task}, noise {options.noise:g}", directory / "learning_curve.png")
+    draw_learning_curve(history, f"{options.task}, noise {options.noise:g}", directory / "learning_curve.png")
 
     learner, learner_std = evaluate(PartialOnly(model), eval_env, options.episodes)
     random, random_std = evaluate(UniformActions(eval_env), eval_env, options.episodes)
@@ -183,10 +210,45 @@ def train(options: argparse.Namespace) -> Path:
         "random_std": random_std,
         "steps": model.num_timesteps,
         "minutes": minutes,
-        "history": [{key: float(value) for key, value in row.items()} for row in callback.history],
+        "history": history,
     }
-    (directory / "results.json").write_text(json.dumps(results, indent=1))
-    return directory
+    (directory / RESULTS).write_text(json.dumps(results, indent=1))
+    shutil.rmtree(directory / CHECKPOINTS)
+
+
+def learn(
+    options: argparse.Namespace, directory: Path, env: VecEnv, eval_env: VecEnv
+) -> tuple[GAC, list[dict[str, float]], float]:
+    """
+    Train from the start, or from the last checkpoint. One is made after every evaluation, and when the process is told to end.
+
+    :param options: see :func:`parse_arguments`
+    :param directory: of the run
+    :param env: to train in
+    :param eval_env: to evaluate in
+    :return: the model, its evaluations, and the minutes that it took, those of a process that was stopped included
+    """
+    every = max(options.steps // EVALUATIONS // options.envs, 1)
+    evaluation = GuiderLearnerEvalCallback(
+        eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=options.episodes, verbose=0
+    )
+    started = time.time()
+    if options.resume is None:
+        model, left, before = GAC("MultiInputPolicy", env, seed=options.seed, **gac_arguments(options)), options.steps, 0.0
+    else:
+        model = GAC.resume(directory / CHECKPOINTS, env)
+        evaluation.history, before = model.resumed_notes["history"], model.resumed_notes["minutes"]
+        evaluation.n_calls = model.num_timesteps // options.envs  # evaluations are counted from the run's start
+        left = model.steps_left
+
+    def notes() -> dict[str, Any]:
+        history = [{key: float(value) for key, value in row.items()} for row in evaluation.history]
+        return {"history": history, "minutes": before + (time.time() - started) / 60}
+
+    checkpoint = ExactCheckpointCallback(directory / CHECKPOINTS, every * options.envs, notes=notes)
+    model.learn(left, callback=[evaluation, checkpoint], reset_num_timesteps=options.resume is None, progress_bar=True)
+    final = notes()
+    return model, final["history"], final["minutes"]
 
 
 def summary(directory: Path) -> str:
@@ -207,5 +269,32 @@ Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. 
     action, _ = model.predict({{"{PARTIAL}": observation}}, deterministic=True)"""
 
 
+def main(arguments: list[str] | None = None) -> None:
+    """
+    Command line.
+
+    :param arguments: by default the process's
+    """
+    options = parse_arguments(arguments)
+    directory = options.resume or start(options)
+    try:
+        train(options, directory)
+    except (KeyboardInterrupt, SystemExit) as stop:
+        print(f"\n{how_to_go_on(directory)}", file=sys.stderr)
+        sys.exit(stop.code if isinstance(stop, SystemExit) else 130)
+    print(summary(directory))
+
+
+def how_to_go_on(directory: Path) -> str:
+    """
+    :param directory: of a run that was stopped
+    :return: what is left of it, and what to do with that
+    """
+    if not checkpoints(directory / CHECKPOINTS):
+        return f"Stopped before there was anything to keep: {directory} has only its configuration."
+    command = f"python -m sb3_gac.train --resume {directory}"
+    return f"Stopped; the last checkpoint is in {directory / CHECKPOINTS}. To go on:\n    {command}"
+
+
 if __name__ == "__main__":
-    print(summary(train(parse_arguments())))
+    main()

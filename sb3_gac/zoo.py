@@ -17,13 +17,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import optuna
-from rl_zoo3 import hyperparams_opt, utils
-from rl_zoo3.enjoy import enjoy
-from rl_zoo3.train import train
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_gac import GAC, AsymmetricSAC
+
+try:
+    import optuna
+    from rl_zoo3 import hyperparams_opt, utils
+    from rl_zoo3.enjoy import enjoy
+    from rl_zoo3.train import train
+except ImportError as error:
+    raise ImportError(f'sb3_gac.zoo needs rl_zoo3, and {error.name} is not there: pip install "sb3_gac[zoo]".') from error
 
 HYPERPARAMS = Path(__file__).parent / "zoo_hyperparams"
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"gac": GAC, "asymmetric_sac": AsymmetricSAC}

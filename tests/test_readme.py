@@ -1,15 +1,19 @@
 """The README's Python, run as it stands there, but for shorter trainings."""
 
+import configparser
+import inspect
 import re
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import SAC
 
 from sb3_gac import GAC
 
-README = (Path(__file__).parents[1] / "README.md").read_text()
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 SHORTER = {"100_000": "600", "1_000_000": "300", "5_000": "150", "20_000": "100"}
 SMALL = {"learning_starts": 100, "batch_size": 16, "buffer_size": 1_000, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
@@ -33,6 +37,27 @@ def test_the_python_of_the_readme_runs(number, tmp_path, monkeypatch):
         pytest.importorskip("popgym")
     monkeypatch.chdir(tmp_path)
     exec(compile(_shorter(BLOCKS[number]), f"README.md, block {number}", "exec"), _names_by_then())
+
+
+def test_what_gac_has_not_of_sac_or_has_otherwise_is_said():
+    (text,) = re.findall(r"GAC is an `OffPolicyAlgorithm`.*?(?=So callbacks)", README, re.DOTALL)
+    ours, sacs = (inspect.signature(algorithm).parameters for algorithm in (GAC, SAC))
+    assert set(re.findall(r"`(use_\w+|sde_\w+)`", text)) == set(sacs) - set(ours)
+    assert {name for name in set(ours) & set(sacs) if ours[name].default != sacs[name].default} == set()
+    policies = [
+        algorithm("MultiInputPolicy", gym.make("sb3_gac/Pendulum-v1"), buffer_size=10).policy for algorithm in (GAC, SAC)
+    ]
+    of_gac, of_sac = ({type(module).__name__ for module in policy.modules()} & {"SiLU", "ReLU", "Tanh"} for policy in policies)
+    assert (of_gac, of_sac) == (set(re.findall("`(SiLU)`", text)), set(re.findall("`(ReLU)`", text)))
+
+
+def test_every_extra_that_a_user_may_need_is_named_where_installing_is_explained():
+    parser = configparser.ConfigParser()
+    parser.read(ROOT / "setup.cfg")
+    (text,) = re.findall(r"## Install\n(.*?)\n## ", README, re.DOTALL)
+    assert "pip install -e ." in text
+    (named,) = re.findall(r"what an extra needs \((.*)\)", text)
+    assert set(named.split(", ")) == set(parser["options.extras_require"]) - {"dev", "brax"}
 
 
 def test_there_is_python_in_the_readme():

@@ -1,19 +1,32 @@
 """The main job, end to end on a tiny budget."""
 
 import json
+import re
+import shlex
+import signal
+import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch as th
 import yaml
 
-from sb3_gac import GAC
-from sb3_gac.train import PartialOnly, gac_arguments, parse_arguments, summary, train
+import sb3_gac.train
+from sb3_gac import GAC, GuiderLearnerEvalCallback
+from sb3_gac.train import PartialOnly, gac_arguments, main, parse_arguments, start, summary, train
+
+QUICK = ["--task", "InvertedDoublePendulum", "--steps", "400", "--seed", "3", "--episodes", "2", "--envs", "2"]
+SMALL = {"learning_starts": 50, "batch_size": 8, "gradient_steps": 1, "policy_kwargs": {"net_arch": [8]}}
 
 
 def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_path):
     options = ["--task", "InvertedDoublePendulum", "--noise", "0.1", "--steps", "2400", "--seed", "3", "--episodes", "2"]
-    directory = train(parse_arguments([*options, "--runs", str(tmp_path)]))
+    options = parse_arguments([*options, "--runs", str(tmp_path)])
+    directory = start(options)
+    train(options, directory)
     assert directory.parent == tmp_path
+    assert {path.name for path in directory.iterdir()} == {"config.yaml", "results.json", "learning_curve.png", "model.zip"}
     assert (directory / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
     configuration = yaml.safe_load((directory / "config.yaml").read_text())
     assert (configuration["task"], configuration["noise"], configuration["seed"]) == ("InvertedDoublePendulum", 0.1, 3)
@@ -59,3 +72,90 @@ def test_a_preset_brings_its_number_of_environments():
 def test_much_noise_has_the_target_kl_of_the_figures():
     assert gac_arguments(parse_arguments(["--noise", "0.3"]))["target_kl"] == 0.001
     assert "target_kl" not in gac_arguments(parse_arguments(["--noise", "0.1"])), "the default"
+
+
+@pytest.fixture
+def _quick(monkeypatch):
+    """Gradient steps from the 50th step on, of a millisecond each."""
+
+    def quick(options):
+        return gac_arguments(options) | SMALL
+
+    monkeypatch.setattr(sb3_gac.train, "gac_arguments", quick)
+    monkeypatch.setattr(sb3_gac.train, "EVALUATIONS", 4)
+
+
+def _stopped_after(steps, by):
+    class Stopped(GuiderLearnerEvalCallback):
+        """What the user does while the run is under way."""
+
+        def _on_step(self):
+            if self.num_timesteps == steps:
+                signal.raise_signal(by)
+            return super()._on_step()
+
+    return Stopped
+
+
+@pytest.mark.usefixtures("_quick")
+@pytest.mark.parametrize(("steps", "by", "status"), [(130, signal.SIGINT, 130), (280, signal.SIGTERM, 143)])
+@pytest.mark.filterwarnings("ignore:Stopped by SIGTERM")
+def test_a_run_that_is_stopped_says_how_to_go_on_and_ends_as_if_it_had_not_been(
+    steps, by, status, tmp_path, monkeypatch, capsys
+):
+    main([*QUICK, "--noise", "0.2", "--privileged", "velocity", "--runs", str(tmp_path / "undisturbed")])
+    with monkeypatch.context() as context:
+        context.setattr(sb3_gac.train, "GuiderLearnerEvalCallback", _stopped_after(steps, by))
+        with pytest.raises(SystemExit) as end:
+            main([*QUICK, "--noise", "0.2", "--privileged", "velocity", "--runs", str(tmp_path / "stopped")])
+    assert end.value.code == status
+    (directory,) = (tmp_path / "stopped").iterdir()
+    assert {path.name for path in directory.iterdir()} == {"config.yaml", "checkpoints"}
+    (command,) = re.findall(r"To go on:\s+python -m sb3_gac.train (.*)", capsys.readouterr().err)
+    main(shlex.split(command))
+    assert str(directory / "model") in capsys.readouterr().out
+    (undisturbed,) = (tmp_path / "undisturbed").iterdir()
+    assert {path.name for path in directory.iterdir()} == {path.name for path in undisturbed.iterdir()}
+    found, expected = (json.loads((path / "results.json").read_text()) for path in (directory, undisturbed))
+    for name in ("learner", "learner_std", "random", "steps"):
+        assert found[name] == expected[name]
+    for name in ("timesteps", "learner", "guider"):
+        assert [row[name] for row in found["history"]] == [row[name] for row in expected["history"]]
+    assert [row["timesteps"] for row in found["history"]] == [100, 200, 300, 400]
+    resumed, model = (GAC.load(path / "model") for path in (directory, undisturbed))
+    for parameter, wanted in zip(resumed.policy.parameters(), model.policy.parameters(), strict=True):
+        assert th.equal(parameter, wanted)
+
+
+@pytest.mark.usefixtures("_quick")
+def test_minutes_are_those_of_all_processes(tmp_path, monkeypatch):
+    clock = iter(range(0, 10**6, 60))  # a minute passes between any two looks at it
+    monkeypatch.setattr(sb3_gac.train, "time", SimpleNamespace(time=lambda: next(clock), strftime=time.strftime))
+    with monkeypatch.context() as context:
+        context.setattr(sb3_gac.train, "GuiderLearnerEvalCallback", _stopped_after(200, signal.SIGINT))
+        with pytest.raises(SystemExit):
+            main([*QUICK, "--runs", str(tmp_path)])
+    (directory,) = tmp_path.iterdir()
+    main(["--resume", str(directory)])
+    minutes = 2 + 2  # from the start to the checkpoint at 100 steps and to that of the stop; to that at 300 and to the end
+    assert json.loads((directory / "results.json").read_text())["minutes"] == minutes
+
+
+@pytest.mark.usefixtures("_quick")
+def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, monkeypatch, capsys):
+    def stopped(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as context:
+        context.setattr(sb3_gac.train, "make_vec_env", stopped)
+        with pytest.raises(SystemExit):
+            main([*QUICK, "--runs", str(tmp_path)])
+    assert "Stopped before there was anything to keep" in capsys.readouterr().err
+    (directory,) = tmp_path.iterdir()
+    with pytest.raises(SystemExit):
+        main(["--resume", str(directory)])
+    assert f"there is no checkpoint in {directory / 'checkpoints'}" in capsys.readouterr().err
+    (directory / "results.json").write_text("{}")
+    with pytest.raises(SystemExit):
+        main(["--resume", str(directory)])
+    assert "this run is finished" in capsys.readouterr().err

@@ -77,6 +77,7 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
     :param gap_tolerance: how much of the guider's mean return the learner may lack, beyond two standard errors
     :param log_path: directory for results, ``None`` for none
     :param kwargs: of ``EvalCallback``
+    :raises TypeError: at the start of training, if the model has no guider
     """
 
     def __init__(
@@ -96,6 +97,14 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
         self._watched: dict[str, float] = {}
         self._in_a_row = {"kl": 0, "bound": 0, "gap": 0}
         self._guider_returns = np.array([])
+
+    def _init_callback(self) -> None:
+        if not hasattr(self.model, "predict_guider"):
+            raise TypeError(
+                f"GuiderLearnerEvalCallback evaluates a guider, which {type(self.model).__name__} does not have: use "
+                "SeededEvalCallback, which evaluates the deployed policy in the same way."
+            )
+        super()._init_callback()
 
     def _on_rollout_start(self) -> None:
         """Collect what the last gradient steps logged: the logger forgets it at every dump."""

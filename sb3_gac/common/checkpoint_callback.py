@@ -10,6 +10,7 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_gac.common.checks import as_sentence
 from sb3_gac.common.env_guard import EnvironmentFailedError
 from sb3_gac.common.resuming import ResumableAlgorithm
 
@@ -98,8 +99,8 @@ class ExactCheckpointCallback(BaseCallback):
             self.model.save_checkpoint(self.directory, self.keep, None if self.notes is None else self.notes())
         except OSError as error:
             warnings.warn(
-                f"The checkpoint after {self.model.num_timesteps} steps could not be written to {self.directory}: {error}. "
-                "Training goes on, and the checkpoint before it is as it was.",
+                f"The checkpoint after {self.model.num_timesteps} steps could not be written to {self.directory}: "
+                f"{as_sentence(error)} Training goes on, and the checkpoint before it is as it was.",
                 stacklevel=2,
             )
             return False

@@ -13,6 +13,27 @@ class UnsupportedActionSpaceError(AssertionError, ValueError):
     """The algorithm can't act in this action space. SB3 raises AssertionError here, so this is one as well."""
 
 
+# --- others' words ------------------------------------------------------------------------------------------------------
+
+
+def as_sentence(said: object) -> str:
+    """
+    :param said: an error, or anything else whose text comes from elsewhere
+    :return: its text, which others may follow: with a full stop, whether it came with one or not
+    """
+    text = str(said).strip()
+    return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def described(error: Exception) -> str:
+    """
+    :param error: any
+    :return: its type and what it says, if it says anything, as a sentence
+    """
+    name = type(error).__name__
+    return as_sentence(f"{name}: {error}" if str(error).strip() else name)
+
+
 # --- arguments ----------------------------------------------------------------------------------------------------------
 
 

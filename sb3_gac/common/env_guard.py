@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_gac.common.checks import entries_of, fault_of, index_bounds, is_finite
+from sb3_gac.common.checks import described, entries_of, fault_of, index_bounds, is_finite
 from sb3_gac.common.env_processes import KEPT, WatchedPipe, end_processes
 from sb3_gac.common.env_use import FINAL, EnvironmentUse, KeepingFinal, SuspiciousEnds
 
@@ -161,7 +161,7 @@ class EnvironmentGuard:
         """An info tells of an episode's end when there is one, and then of this one."""
         if len(infos) != len(dones):
             raise InvalidStepError(
-                f"{len(dones)} environments returned {len(infos)} info dicts; the step was not stored. Return one for each; {GO_ON}."
+                f"{len(dones)} environments returned {len(infos)} info dicts; the step was not stored. Return one each; {GO_ON}."
             )
         for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
             if done:
@@ -209,7 +209,7 @@ class EnvironmentGuard:
         for frame, _ in traceback.walk_tb(error.__traceback__):  # SB3's own loops know which environment they are at
             if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
                 return EnvironmentFailedError(
-                    f"Environment {frame.f_locals['env_idx']} raised {type(error).__name__}: {error} {KEPT}: mend the "
+                    f"Environment {frame.f_locals['env_idx']} raised {described(error)} {KEPT}: mend the "
                     f"environment; {GO_ON}, or set_env(...) first gives the model another one."
                 )
             if frame.f_code.co_name == "_stack_obs":

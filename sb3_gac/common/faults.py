@@ -9,7 +9,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
 from typing_extensions import Self
 
-from sb3_gac.common.checks import check_same_spaces
+from sb3_gac.common.checks import as_sentence, check_same_spaces
 from sb3_gac.common.collecting import DataCollection
 from sb3_gac.common.env_guard import FAULTS
 
@@ -83,7 +83,7 @@ class FaultTolerance(DataCollection):
         except BaseException as error:
             self._last_obs = None
             if isinstance(error, FAULTS):
-                error.args = (f"{error} It happened after {self.num_timesteps} steps (num_timesteps).",)
+                error.args = (f"{as_sentence(error)} It happened after {self.num_timesteps} steps (num_timesteps).",)
             raise
 
 

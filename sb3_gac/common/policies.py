@@ -239,6 +239,23 @@ class AsymmetricPolicy(BasePolicy):
         """Whether the two halves of a gradient step share nothing that either changes."""
         return not self.share_features_extractor
 
+    def check_seen_by(self, role: str, observation: Any, where: str) -> None:
+        """
+        :param role: that is about to act
+        :param observation: that it was handed
+        :param where: the method that was called, for the message
+        :raises ValueError: if an entry is missing that the role or, because it acts beside it, the deployed policy reads
+        """
+        reads = list(dict.fromkeys([*self.role_keys[role], *self.role_keys[self.roles.deployed]]))
+        if not isinstance(observation, Mapping):
+            raise ValueError(f"The {role} reads {reads}: pass {where} a dict with these entries, not an array.")
+        missing = [key for key in reads if key not in observation]
+        if missing:
+            raise ValueError(
+                f"The observation passed to {where} lacks {missing}, which the {role} reads; it has {list(observation)}. "
+                f"predict() is for observations of {list(self.role_keys[self.roles.deployed])} alone."
+            )
+
     @abstractmethod
     def behaviour_action(
         self,

@@ -86,16 +86,15 @@ def resolve_role_keys(
             f'{roles.deployed} may see to "{PARTIAL}", or name it with role_keys={{"{roles.deployed}": ["<entry>"]}}.'
         )
     resolved = dict.fromkeys(roles.all, entries) | {roles.deployed: (PARTIAL,)}
-    for role, keys in _for_each_role(roles, role_keys).items():
+    for name, keys in role_keys.items():
         if isinstance(keys, str) or not keys:
-            raise ValueError(f'role_keys["{role}"] must be a non-empty list of observation entries, got {keys!r}.')
+            raise ValueError(f'role_keys["{name}"] must be a non-empty list of observation entries, got {keys!r}.')
         unknown_keys = [key for key in keys if key not in entries]
         if unknown_keys:
             raise ValueError(
-                f'role_keys["{role}"] names unknown observation entries {unknown_keys}; the observation has {list(entries)}.'
+                f'role_keys["{name}"] names unknown observation entries {unknown_keys}; the observation has {list(entries)}.'
             )
-        resolved[role] = tuple(keys)
-    return resolved
+    return resolved | {role: tuple(keys) for role, keys in _for_each_role(roles, role_keys).items()}
 
 
 def role_space(observation_space: spaces.Dict, keys: Sequence[str]) -> spaces.Dict:

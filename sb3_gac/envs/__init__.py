@@ -5,8 +5,10 @@ from sb3_gac.envs.mujoco import make_mujoco, register_mujoco
 from sb3_gac.envs.pendulum import make_pendulum, register_pendulum
 from sb3_gac.envs.popgym import make_popgym, register_popgym
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
+from sb3_gac.envs.subprocesses import take_along
 from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDictObservation, SplitObservation
 
+take_along()
 register_mujoco()
 register_pendulum()
 register_popgym()

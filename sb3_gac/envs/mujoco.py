@@ -17,6 +17,9 @@ Swimmer                  qpos[2:] 3, qvel 5                                    3
 are equivalents of the paper's Brax tasks, not reproductions: time step and control ranges are gymnasium's.
 """
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
@@ -34,6 +37,10 @@ def _humanoid(env_id: str) -> TaskLayout:
     partial = (*range(22), *range(45, 175), *range(253, 270))
     velocity = (*range(22, 45), *range(175, 253))
     return TaskLayout(env_id, partial, velocity, {"include_cfrc_ext_in_observation": False})
+
+
+#: In an XML of gymnasium's, where nobody who makes a task can change it
+_DEPRECATED = "compiler attribute 'settotalmass' is deprecated"
 
 
 TASKS: dict[str, TaskLayout] = {
@@ -63,7 +70,33 @@ def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", **
     misplacing = sorted(name for name in kwargs if name.endswith("_observation"))
     if misplacing:
         raise ValueError(f"{misplacing} would change the observation, of which the split is made by position.")
-    return make_task(TASKS[task], noise_std, privileged, **kwargs)
+    with _without_deprecation():
+        return make_task(TASKS[task], noise_std, privileged, **kwargs)
+
+
+@contextmanager
+def _without_deprecation() -> Iterator[None]:
+    """
+    While a model is compiled, MuJoCo would write :data:`_DEPRECATED` to stderr and to a file in the working directory. What
+    else it warns of goes where it went before: to a handler, or, where there was none, to Python's warnings.
+    """
+    import mujoco
+
+    before = mujoco.get_mju_user_warning()
+
+    def handle(message: str) -> None:
+        if _DEPRECATED in message:
+            return
+        if before is None:
+            warnings.warn(f"MuJoCo: {message}", stacklevel=2)
+        else:
+            before(message)
+
+    mujoco.set_mju_user_warning(handle)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def register_mujoco() -> None:

@@ -198,7 +198,9 @@ class GAC(GuidedUpdate):
         :param episode_start: true where an episode starts, shape (B,)
         :param deterministic: mode instead of a sample
         :return: action in the environment's range, and the state for the next call
+        :raises ValueError: if an entry that the guider reads is missing
         """
+        self.policy.check_seen_by("guider", observation, "predict_guider()")
         self.policy.set_training_mode(False)
         _, vectorized = self.policy.obs_to_tensor(observation)
         scaled_action, state = self.policy.behaviour_action(observation, state, episode_start, deterministic)

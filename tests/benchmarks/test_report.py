@@ -65,6 +65,24 @@ def test_the_page_draws_seeds_band_mean_and_guider():
     error = 1.96 * 1000 * 0.5**0.5 / 2**0.5
     assert list(band.y) == pytest.approx([1500 + error, 3000 + 2 * error, 3000 - 2 * error, 1500 - error])
     assert [line.name for line in figure.data if line.showlegend] == ["sac"], "once for all cells"
+    figure = interactive(pd.concat([_tidy(["gac", "gac-gru"], guider=True), _tidy(["sac"])]))
+    named = [(line.name, line.line.dash) for line in figure.data if line.showlegend]
+    dashed = [("gac", None), ("gac, guider", "dash"), ("gac-gru", None), ("gac-gru, guider", "dash"), ("sac", None)]
+    assert named == dashed, "what dashes are is read off the legend"
+
+
+def test_axes_have_names_and_cells_without_runs_say_so():
+    tidy = pd.concat([_tidy(["gac"]), _tidy(["gac"]).query("task == 'Hopper'").assign(noise=0.3)])
+    figure = interactive(tidy)
+    axes = [(axis.title.text, axis.visible) for axis in (*figure.select_xaxes(), *figure.select_yaxes())]
+    shown, hidden = (None, False)
+    empty = [shown, shown, hidden, shown]  # Ant and Hopper at 0.1, Ant and Hopper at 0.3
+    assert axes == [("environment steps", is_shown) for is_shown in empty] + [("return", is_shown) for is_shown in empty]
+    (words,) = [note for note in figure.layout.annotations if note.text == "not run yet"]
+    left, right = figure.layout.xaxis3.domain
+    below, above = figure.layout.yaxis3.domain
+    assert (words.xref, words.yref) == ("paper", "paper")
+    assert (left < words.x < right, below < words.y < above) == (True, True)
 
 
 def test_algorithms_beyond_the_eighth_are_drawn_in_colors_of_their_own():

@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, GuiderLearnerEvalCallback
+from sb3_gac import GAC, AsymmetricSAC, GuiderLearnerEvalCallback, SeededEvalCallback
 
 EPISODE_LENGTH = 5
 
@@ -118,6 +118,15 @@ def test_both_policies_start_from_the_same_observations_at_every_evaluation(n_en
         assert all(chunk == chunks[0] for chunk in chunks)
         assert len({tuple(start) for start in chunks[0]}) == n_resets
     assert starts[0] != starts[-1] or n_envs == 1
+
+
+def test_a_model_without_a_guider_is_named():
+    model = AsymmetricSAC("MultiInputPolicy", Paid(), buffer_size=100, policy_kwargs={"net_arch": [4]}, device="cpu")
+    with pytest.raises(TypeError, match="a guider, which AsymmetricSAC does not have: use SeededEvalCallback"):
+        model.learn(10, callback=GuiderLearnerEvalCallback(Paid(), eval_freq=5))
+    callback = SeededEvalCallback(Monitor(Paid()), eval_freq=5, n_eval_episodes=1, verbose=0)
+    model.learn(10, callback=callback)
+    assert [row["timesteps"] for row in callback.history] == [5, 10]
 
 
 def test_works_under_vec_normalize():

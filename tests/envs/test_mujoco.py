@@ -3,10 +3,12 @@
 import pickle
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_gac.envs import make_mujoco
 
@@ -54,6 +56,66 @@ def _random_steps(env, n):
     for _ in range(n):
         observation, *_ = env.step(env.action_space.sample())
     return observation
+
+
+@pytest.mark.parametrize("task", ["HalfCheetah", "Ant"])
+@pytest.mark.parametrize("vectorized", [False, True])
+def test_making_a_task_says_nothing_and_leaves_nothing_behind(task, vectorized, tmp_path, monkeypatch, capfd, recwarn):
+    """gymnasium's own HalfCheetah warns on stderr, once for each environment, and in a file."""
+    monkeypatch.chdir(tmp_path)
+    env = make_vec_env(f"sb3_gac/{task}-v5", 2) if vectorized else _make(task)
+    env.reset()
+    env.close()
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []
+    assert not [str(warning.message) for warning in recwarn if "MuJoCo" in str(warning.message)]
+    gym.make(f"{task}-v5")
+    assert ("settotalmass" in capfd.readouterr().err) == (task == "HalfCheetah"), "gymnasium's own is what it was"
+
+
+@pytest.fixture
+def _muted(monkeypatch, tmp_path):
+    """Whatever a test does to MuJoCo's handler, and what the library writes without one."""
+    monkeypatch.chdir(tmp_path)
+    yield
+    mujoco.set_mju_user_warning(None)
+
+
+def _compile_a_model_that_warns_twice(*args):
+    xml = '<mujoco><compiler settotalmass="1"/><worldbody><body><geom size="1"/></body></worldbody></mujoco>'
+    mujoco.MjModel.from_xml_string(xml)
+    _diverge()
+
+
+def _diverge():
+    """MuJoCo warns of a state that is no number."""
+    model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>')
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.nan
+    mujoco.mj_step(model, data)
+
+
+@pytest.mark.usefixtures("_muted")
+def test_other_warnings_of_mujoco_are_passed_on(monkeypatch):
+    monkeypatch.setattr("sb3_gac.envs.mujoco.make_task", _compile_a_model_that_warns_twice)
+    with pytest.warns(UserWarning, match="MuJoCo: .*Nan") as caught:
+        make_mujoco("HalfCheetah")
+    assert not [warning for warning in caught if "settotalmass" in str(warning.message)]
+    assert mujoco.get_mju_user_warning() is None
+    heard = []
+    mujoco.set_mju_user_warning(heard.append)
+    make_mujoco("HalfCheetah")
+    assert len(heard) == 1
+    assert "Nan" in heard[0]
+    mujoco.MjModel.from_xml_string('<mujoco><compiler settotalmass="1"/></mujoco>')
+    assert len(heard) == 2, "the handler is the one that it was"
+
+
+@pytest.mark.usefixtures("_muted")
+def test_a_task_that_cannot_be_made_leaves_the_handler_alone():
+    with pytest.raises(OSError, match="does not exist"):
+        make_mujoco("HalfCheetah", xml_file="/no/such.xml")
+    assert mujoco.get_mju_user_warning() is None
 
 
 @all_tasks

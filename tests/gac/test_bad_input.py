@@ -7,8 +7,10 @@ from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import InvalidStepError
+from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, InvalidStepError
 from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
+
+ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
 
 
 class _Poisoned(TwoViewBandit):
@@ -191,6 +193,38 @@ def test_predict_with_a_bare_array_needs_a_learner_with_one_entry():
     model = small_model(role_keys={"learner": ["partial", "privileged"]})
     with pytest.raises(ValueError, match=r"reads \['partial', 'privileged'\]"):
         model.predict(np.zeros(2, np.float32))
+
+
+@pytest.mark.parametrize("cls", [GAC, GACShare, GACWithoutQ])
+@pytest.mark.parametrize("policy", ["MultiInputPolicy", "MultiInputGruPolicy"])
+def test_predict_guider_names_what_the_guider_lacks(cls, policy):
+    model = small_model(TwoViewBandit(length=5), cls=cls, policy=policy, batch_size=2)
+    partial, privileged = np.zeros(2, np.float32), np.zeros(1, np.float32)
+    with pytest.raises(ValueError, match=r"predict_guider\(\) lacks \['privileged'\], which the guider reads; it has"):
+        model.predict_guider({"partial": partial})
+    with pytest.raises(ValueError, match=r"lacks \['partial'\]"):
+        model.predict_guider({"privileged": privileged})
+    with pytest.raises(ValueError, match=r"guider reads \['partial', 'privileged'\]: pass predict_guider\(\) a dict"):
+        model.predict_guider(partial)
+    action, _ = model.predict_guider({"partial": partial, "privileged": privileged})
+    assert action.shape == (1,)
+
+
+def test_a_guider_of_one_entry_still_needs_what_its_learner_reads():
+    model = small_model(role_keys={"guider": ["privileged"]})
+    with pytest.raises(ValueError, match=r"lacks \['partial'\]"):
+        model.predict_guider({"privileged": np.zeros(1, np.float32)})
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("keys", [["priviledged"], "privileged", []])
+def test_role_keys_are_named_as_they_were_written(cls, keys):
+    roles = ["critic", *cls.policy_aliases["MultiInputPolicy"].roles.all]
+    for role in roles:
+        with pytest.raises(ValueError, match=rf'^role_keys\["{role}"\]'):
+            small_model(cls=cls, role_keys={role: keys})
+    with pytest.raises(ValueError, match=r'^role_keys\["critic"\]'):
+        small_model(cls=cls, role_keys={role: ["partial"] for role in roles} | {"critic": keys})
 
 
 def test_guider_alone_is_refused_with_a_pointer():

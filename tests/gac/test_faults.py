@@ -1,6 +1,7 @@
 """An environment that raises, or whose process dies, is named, and nothing that was learned is lost."""
 
 import os
+import re
 import signal
 
 import numpy as np
@@ -8,16 +9,16 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sb3_gac import GAC, EnvironmentFailedError, InvalidStepError
+from sb3_gac import GAC, AsymmetricSAC, EnvironmentFailedError, InvalidStepError
 from tests.helpers import TwoViewBandit, small_model
 
 
 class _Broken(TwoViewBandit):
     """Breaks in one step, or at its reset, in one of several ways."""
 
-    def __init__(self, how, at_step=20):
+    def __init__(self, how, at_step=20, says="the simulation exploded"):
         super().__init__(length=5)
-        self.how, self.at_step, self.steps = how, at_step, 0
+        self.how, self.at_step, self.says, self.steps = how, at_step, says, 0
 
     def reset(self, *, seed=None, options=None):
         if self.at_step == 0:
@@ -36,7 +37,7 @@ class _Broken(TwoViewBandit):
             os.kill(os.getpid(), signal.SIGKILL)
         if self.how == "exit":
             os._exit(7)
-        raise RuntimeError("the simulation exploded")
+        raise RuntimeError(self.says)
 
 
 def _broken(how, at_step=20):
@@ -141,6 +142,24 @@ def test_an_environment_that_raises_is_named_and_training_goes_on_with_it(wrappe
         _assert_intact(model, 38, tmp_path)
     model.learn(20, reset_num_timesteps=False)
     assert model.num_timesteps == 58
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+@pytest.mark.parametrize(
+    ("says", "said"),
+    [
+        ("it fell", "RuntimeError: it fell. Nothing"),
+        ("It fell.", "RuntimeError: It fell. Nothing"),
+        ("why?\n", "RuntimeError: why? Nothing"),
+        ("", "raised RuntimeError. Nothing"),
+    ],
+)
+def test_what_an_environment_says_stays_apart_from_what_is_said_of_it(cls, says, said):
+    model = small_model(_Broken("raise", at_step=3, says=says), cls=cls)
+    with pytest.raises(EnvironmentFailedError, match=re.escape(said)):
+        model.learn(10)
+    with pytest.raises(EnvironmentFailedError, match=re.escape(said)):
+        small_model(_Broken("raise", at_step=0, says=says), cls=cls).learn(10)
 
 
 def test_an_environment_that_raises_at_reset_is_named():

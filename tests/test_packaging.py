@@ -1,0 +1,66 @@
+"""What an installation brings: extras that are named where they are missing, and a path that type checkers can follow."""
+
+import configparser
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[1]
+EXPORT = """
+import sb3_gac
+env = sb3_gac.envs.make_pendulum()
+model = sb3_gac.GAC("MultiInputPolicy", env, buffer_size=10, policy_kwargs={"net_arch": [4]})
+sb3_gac.export_learner(model, "never-written.onnx")
+"""
+PARTS = {  # extra -> what of it is needed, and what needs it
+    "zoo": (["rl_zoo3", "optuna"], "import sb3_gac.zoo"),
+    "export": (["onnx"], EXPORT),
+    "export, not onnx": (["onnxruntime"], EXPORT),
+    "export, learner": (["onnxruntime"], "import sb3_gac.learner"),
+    "popgym": (["popgym"], "import gymnasium; gymnasium.make('sb3_gac:sb3_gac/popgym-AutoencodeEasy-v0')"),
+    "benchmarks": (["pandas", "plotly"], "import benchmarks.launch"),
+    "benchmarks, report": (["plotly"], "import benchmarks.report"),
+    "benchmarks, aggregate": (["rliable"], "import benchmarks.aggregate"),
+    "benchmarks, run": (["tensorboard"], "import benchmarks.run"),
+    "ray": (["ray"], "from benchmarks.engines import RayEngine; RayEngine('auto')"),
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_what_is_not_installed_is_named_with_its_extra(part, tmp_path):
+    modules, program = PARTS[part]
+    hide = f"import sys; sys.modules.update(dict.fromkeys({modules!r})); sys.path.insert(0, {str(ROOT)!r})\n"
+    result = subprocess.run([sys.executable, "-c", hide + program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    message = result.stderr.strip().splitlines()[-1]
+    assert message.startswith("ImportError: ")
+    assert f"[{part.split(',')[0]}]" in message
+    assert any(name.lower() in message.lower() for name in modules)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_extras_bring_what_their_parts_need():
+    parser = configparser.ConfigParser()
+    parser.read(ROOT / "setup.cfg")
+    for part, (modules, _) in PARTS.items():
+        lines = parser["options.extras_require"][part.split(",")[0]].split("\n")
+        names = {Requirement(line).name for line in lines if line}
+        assert set(modules) - {"optuna"} <= names, "optuna comes with rl_zoo3"
+
+
+def test_an_editable_installation_is_a_path_that_type_checkers_follow(tmp_path):
+    """An import hook, the default, is followed by nothing but Python."""
+    pytest.importorskip("setuptools", minversion="77")
+    for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, tmp_path)
+    shutil.copytree(ROOT / "sb3_gac", tmp_path / "sb3_gac", ignore=shutil.ignore_patterns("__pycache__"))
+    build = "from setuptools.build_meta import build_editable; print(build_editable('.'))"
+    subprocess.run([sys.executable, "-c", build], cwd=tmp_path, capture_output=True, check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as contents:
+        (pth,) = [name for name in contents.namelist() if name.endswith(".pth")]
+        assert contents.read(pth).decode().split() == [str(tmp_path)]
