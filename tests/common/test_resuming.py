@@ -1,5 +1,6 @@
 """Training 2 N steps is N, a checkpoint, another process, and N: to the bit."""
 
+import random
 import shutil
 import subprocess
 import sys
@@ -82,6 +83,19 @@ def test_resumed_training_is_the_uninterrupted_one(name, tmp_path):
     assert 0 < last.steps_left < 2 * N
     last.learn(last.steps_left, reset_num_timesteps=False)
     _assert_same(whole, last)
+
+
+def _draw_of_everyone(model):
+    """What each generator gives next that environments, noise, buffers and policies may draw from."""
+    return random.random(), np.random.random(), th.rand(1).item(), model.action_space.sample().item()
+
+
+def test_every_generator_goes_on_where_it_was(tmp_path):
+    model = small_model().learn(20)
+    model.save_checkpoint(tmp_path)
+    expected = _draw_of_everyone(model)
+    resumed = GAC.resume(tmp_path, TwoViewBandit(), device="cpu")
+    assert _draw_of_everyone(resumed) == expected
 
 
 class _InterruptedError(Exception):

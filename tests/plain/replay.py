@@ -23,14 +23,16 @@ class Recorded(gym.Env):
     """
     Random observations and rewards; episodes of one to six steps, half of which terminate, while the others run out of time.
 
-    :param discrete: whether actions are one of three, instead of two numbers in ranges of their own
+    :param discrete: whether actions are one of three, instead of numbers in ranges of their own
+    :param n_actions: how many numbers
     """
 
-    def __init__(self, discrete: bool = False):
+    def __init__(self, discrete: bool = False, n_actions: int = 2):
         self.observation_space = spaces.Dict(
             partial=spaces.Box(-np.inf, np.inf, (3,), np.float32), privileged=spaces.Box(-np.inf, np.inf, (2,), np.float32)
         )
-        low, high = np.array([-2.0, 0.0], np.float32), np.array([1.0, 0.5], np.float32)
+        low = -np.arange(n_actions, dtype=np.float32)
+        high = 1 + np.arange(n_actions, dtype=np.float32) / 2
         self.action_space = spaces.Discrete(3) if discrete else spaces.Box(low, high)
         self.steps: list[Step] = []
 
