@@ -4,6 +4,7 @@ Guided Actor-Critic's Algorithm 1 and SAC with asymmetric critics as one would w
 One network after the other, torch's own layers, densities, optimisers and clipping. Nothing of the package is used.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -62,7 +63,8 @@ class Choice(NamedTuple):
 class Coefficient:
     """exp of a number that Adam moves up while its constraint is violated; or a fixed number."""
 
-    def __init__(self, given: str | float, rate: float, bounds: tuple[float, float] = (1e-8, 1e4)):
+    def __init__(self, name: str, given: str | float, rate: float, bounds: tuple[float, float] = (1e-8, 1e4)):
+        self.name = name
         self.learned = isinstance(given, str)
         self.log_value = th.tensor(float(str(given).removeprefix("auto_")), dtype=th.float64).log().requires_grad_()
         self.log_bounds = th.tensor(bounds, dtype=th.float64).log()
@@ -72,14 +74,16 @@ class Coefficient:
     def value(self) -> th.Tensor:
         return self.log_value.detach().exp()
 
-    def update(self, mean_violation: th.Tensor) -> None:
+    def update(self, mean_violation: th.Tensor) -> dict[str, th.Tensor]:
         if not self.learned:
-            return
+            return {}
         self.optimizer.zero_grad()
-        (-self.log_value.exp() * mean_violation.detach()).backward()
+        loss = -self.log_value.exp() * mean_violation.detach()
+        loss.backward()
         self.optimizer.step()
         with th.no_grad():
             self.log_value.clamp_(*self.log_bounds)
+        return {f"{self.name}_loss": loss}
 
 
 @dataclass
@@ -131,9 +135,10 @@ class PlainAlgorithm:
             name: settings.optimizer(network.parameters(), lr=settings.rates.get(name, settings.learning_rate))
             for name, network in self.networks.items()
         }
-        self.beta = Coefficient(settings.ent_coef, settings.learning_rate)
+        self.beta = Coefficient("ent_coef", settings.ent_coef, settings.learning_rate)
         self.discrete = not hasattr(policy.action_space, "low")
         self.n_steps_done = 0
+        self.logged: dict[str, th.Tensor] = {}
 
     @staticmethod
     def copied(policy: Any, name: str) -> nn.Module:
@@ -158,13 +163,17 @@ class PlainAlgorithm:
 
         return values
 
-    def critic_loss(self, critics: Any, batch: Batch, y: th.Tensor) -> th.Tensor:
+    def fit_critics(self, name: str, batch: Batch, y: th.Tensor) -> None:
         """Half the mean square of each critic's error, summed up over critics."""
+        critics = self.networks[name]
         if self.discrete:
             q = [values.gather(-1, batch.actions.long())[..., 0] for values in self.q(critics, batch)(None)]
         else:
             q = self.q(critics, batch)(batch.actions)
-        return th.stack([0.5 * batch.mean((one - y).square()) for one in q]).sum()
+        loss = th.stack([0.5 * batch.mean((one - y).square()) for one in q]).sum()
+        self.logged[f"{name}_q"] = th.stack([batch.mean(one) for one in q]).mean()
+        self.logged[f"{name}_loss"] = loss
+        self.descend(name, loss)
 
     def descend(self, name: str, loss: th.Tensor, unclipped: list[nn.Parameter] | None = None) -> None:
         """One step of one network; the norm that is bounded is that of all its gradients but some."""
@@ -172,9 +181,10 @@ class PlainAlgorithm:
         gradients = th.autograd.grad(loss, parameters, allow_unused=True)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = th.zeros_like(parameter) if gradient is None else gradient
+        others = {id(parameter) for parameter in unclipped or []}
+        clipped = [parameter for parameter in parameters if id(parameter) not in others]
+        self.logged[f"{name}_grad_norm"] = th.cat([parameter.grad.flatten() for parameter in clipped]).norm()
         if self.settings.max_grad_norm is not None:
-            others = {id(parameter) for parameter in unclipped or []}
-            clipped = [parameter for parameter in parameters if id(parameter) not in others]
             nn.utils.clip_grad_norm_(clipped, self.settings.max_grad_norm)
         self.optimizers[name].step()
 
@@ -188,6 +198,15 @@ class PlainAlgorithm:
         """Of a policy's network, at the observations and at the next ones."""
         hidden = [network.hidden(seen) for seen in self.seen(network, batch)]
         return [{name: head(x) for name, head in network.heads.items()} for x in hidden]
+
+    def described(self, name: str, policy: Any, batch: Batch) -> dict[str, th.Tensor]:
+        """What is logged of the deployed policy, and the temperature."""
+        if isinstance(policy, Choice):
+            of_policy = {"max_prob": policy.logits.softmax(dim=-1).amax(dim=-1)}
+        else:
+            of_policy = {"std": policy.std.mean(dim=-1), "mean_abs": policy.mean.abs().mean(dim=-1)}
+        means = {f"{name}_{quantity}": batch.mean(values) for quantity, values in of_policy.items()}
+        return {**means, "ent_coef": self.beta.value}
 
     def update_targets(self) -> None:
         """tau theta + (1 - tau) theta_bar."""
@@ -213,7 +232,7 @@ class PlainGAC(PlainAlgorithm):
     def __init__(self, policy: Any, settings: Settings):
         names = ["guider_critic", "guider", "learner"] + ["learner_critic"] * (policy.learner_critic is not None)
         super().__init__(policy, names, settings)
-        self.alpha = Coefficient(settings.kl_coef, settings.kl_coef_learning_rate, settings.kl_coef_bounds)
+        self.alpha = Coefficient("kl_coef", settings.kl_coef, settings.kl_coef_learning_rate, settings.kl_coef_bounds)
         self.theta, self.theta_bar = self.networks["guider_critic"], self.targets["guider_critic_target"]
         self.phi = self.networks.get("learner_critic", self.theta)
         self.phi_bar = self.targets.get("learner_critic_target")
@@ -256,11 +275,9 @@ class PlainGAC(PlainAlgorithm):
             if self.phi_bar is not None:
                 q, log_prob = next_pi.expectation(self.q(self.phi_bar, batch, later=True), noise[2])
                 y_phi = batch.rewards + future * (q - beta_of_learner * log_prob)
-        critic_losses = {"guider_critic_loss": self.critic_loss(self.theta, batch, y_theta)}
+        self.fit_critics("guider_critic", batch, y_theta)
         if self.phi_bar is not None:
-            critic_losses["learner_critic_loss"] = self.critic_loss(self.phi, batch, y_phi)
-        for name, loss in critic_losses.items():
-            self.descend(name.removesuffix("_loss"), loss)
+            self.fit_critics("learner_critic", batch, y_phi)
         # Eq. 13
         kl = mu.kl(pi.detach(), reduction)
         q, log_prob = mu.expectation(self.q(self.theta, batch), noise[1])
@@ -271,12 +288,14 @@ class PlainGAC(PlainAlgorithm):
         fit, its_parameters = self.fit_of_the_std(batch, guider_outputs[0])
         self.descend("learner", learner_loss + fit, its_parameters)
         # Eq. 17, and SAC's
-        self.beta.update(batch.mean(log_prob) + settings.target_entropy)
-        self.alpha.update(batch.mean(kl) - settings.target_kl)
+        self.logged |= self.beta.update(batch.mean(log_prob) + settings.target_entropy)
+        self.logged |= self.alpha.update(batch.mean(kl) - settings.target_kl)
         self.update_targets()
-        losses = {**critic_losses, "guider_loss": guider_loss, "learner_loss": learner_loss}
-        above = batch.mean((kl > settings.target_kl).double())
-        return {**losses, "kl": batch.mean(kl), "entropy": -batch.mean(log_prob), "kl_above_target": above}
+        ordered = kl[batch.counts > 0].sort().values
+        self.logged |= {"guider_loss": guider_loss, "learner_loss": learner_loss, "entropy": -batch.mean(log_prob)}
+        self.logged |= {"kl": batch.mean(kl), "kl_above_target": batch.mean((kl > settings.target_kl).double())}
+        self.logged |= {"kl_p95": ordered[math.ceil(0.95 * len(ordered)) - 1], "kl_coef": self.alpha.value}
+        return self.logged | self.described("learner", pi, batch)
 
     def learner_loss(self, batch: Batch, mu: Any, pi: Any, noise: th.Tensor, alpha: Any, beta: Any) -> th.Tensor:
         """Eq. 16; of GACShare phi is theta."""
@@ -327,11 +346,11 @@ class PlainSAC(PlainAlgorithm):
         with th.no_grad():
             q, log_prob = later.expectation(self.q(targets, batch, later=True), noise[0])
             y = batch.rewards + batch.discounts * (1 - batch.terminated) * (q - beta * log_prob)
-        critic_loss = self.critic_loss(critics, batch, y)
-        self.descend("critic", critic_loss)
+        self.fit_critics("critic", batch, y)
         q, log_prob = now.expectation(self.q(critics, batch), noise[1])
         actor_loss = batch.mean(beta * log_prob - q)
         self.descend("actor", actor_loss)
-        self.beta.update(batch.mean(log_prob) + self.settings.target_entropy)
+        self.logged |= self.beta.update(batch.mean(log_prob) + self.settings.target_entropy)
         self.update_targets()
-        return {"critic_loss": critic_loss, "actor_loss": actor_loss, "entropy": -batch.mean(log_prob)}
+        self.logged |= {"actor_loss": actor_loss, "entropy": -batch.mean(log_prob)}
+        return self.logged | self.described("actor", now, batch)
