@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
-from tests.helpers import small_model
+from tests.helpers import optimizers_of, small_model, unlike_each_other
 from tests.plain.replay import Recorded
 
 ALGORITHMS = pytest.mark.parametrize("cls", [GAC, GACShare, GACWithoutQ, AsymmetricSAC])
@@ -62,16 +63,52 @@ def test_the_behaviour_policy_explores_unless_it_is_asked_not_to(cls, discrete):
     np.testing.assert_allclose(chosen, chosen[:1].repeat(200, axis=0), atol=1e-6)
 
 
+@pytest.mark.parametrize("guider", ["residual", "independent"])
+@pytest.mark.parametrize("std_of", ["learner", "guider"])
+def test_what_the_guider_does_is_what_its_distribution_says(guider, std_of):
+    """Its mode in the environment's range; and about that the std that both policies have."""
+    model = small_model(Recorded(), guider=guider, std_of=std_of)
+    unlike_each_other(model.policy, scale=0.2)
+    obs = {"partial": np.full((4000, 3), 0.3, np.float32), "privileged": np.full((4000, 2), -0.2, np.float32)}
+    with th.no_grad():
+        distribution = model.policy.distributions(model.policy.obs_to_tensor(obs)[0]).guider
+    low, high = model.action_space.low, model.action_space.high
+    by_hand = low + (np.tanh(distribution.mean.numpy()) + 1) / 2 * (high - low)
+    chosen, _ = model.predict_guider(obs, deterministic=True)
+    np.testing.assert_allclose(chosen, by_hand, atol=1e-5)
+    sampled, _ = model.predict_guider(obs)
+    np.testing.assert_allclose(
+        np.arctanh(np.clip(2 * (sampled - low) / (high - low) - 1, -1 + 1e-6, 1 - 1e-6)).std(axis=0),
+        distribution.log_std[0].exp().numpy(),
+        rtol=0.05,
+    )
+
+
+@ALGORITHMS
+@pytest.mark.parametrize("policy", ["MultiInputPolicy", "MultiInputGruPolicy", "MultiInputLstmPolicy"])
+def test_predict_gives_actions_in_the_environments_range_and_samples_on_request(cls, policy):
+    model = small_model(Recorded(), cls, policy=policy, policy_kwargs={"net_arch": [8]})
+    unlike_each_other(model.policy, scale=0.2)
+    obs = {"partial": np.full((500, 3), 0.3, np.float32)}
+    actor = model.policy.deployed
+    with th.no_grad():
+        distribution, _ = actor.remember(actor.obs_to_tensor(obs)[0], None, None)
+    low, high = model.action_space.low, model.action_space.high
+    by_hand = low + (np.tanh(distribution.mean.numpy()) + 1) / 2 * (high - low)
+    chosen, _ = model.predict(obs, deterministic=True)
+    np.testing.assert_allclose(chosen, by_hand, atol=1e-5)
+    sampled, _ = model.predict(obs)
+    assert (sampled.std(axis=0) > 0.02).all()
+    assert model.action_space.contains(sampled.min(axis=0))
+    assert model.action_space.contains(sampled.max(axis=0))
+
+
 @ALGORITHMS
 def test_all_rates_but_kl_coefs_follow_the_schedule(cls):
     model = small_model(cls=cls, learning_rate=LinearSchedule(1e-3, 5e-4, 1.0)).learn(50)
     expected = model.lr_schedule(model._current_progress_remaining)
     assert 5e-4 <= expected < 6e-4
-    optimizers = [
-        model.actor.optimizer,
-        model.policy.critic_pairs["guider_critic" if cls is not AsymmetricSAC else "critic"][0].optimizer,
-    ]
-    for optimizer in (*optimizers, model.ent_coef_optimizer):
+    for optimizer in (*optimizers_of(model.policy), model.ent_coef_optimizer):
         assert optimizer.param_groups[0]["lr"] == pytest.approx(expected)
     if cls is not AsymmetricSAC:
         assert model.kl_coef_dual.optimizer.param_groups[0]["lr"] == model.kl_coef_learning_rate

@@ -183,6 +183,18 @@ def test_statistics_that_were_not_loaded_are_asked_for(tmp_path):
     assert export_learner(loaded, tmp_path / "other.onnx").read_bytes() == expected
 
 
+def test_a_file_is_compared_on_what_the_policy_may_see():
+    """Normalised entries spread about their mean by twice the std, others over their space."""
+    model = small_model(_normalised()).learn(60)
+    normalizer = DeploymentNormalizer.from_vec_normalize(model.get_vec_normalize_env())
+    drawn = normalizer(draw_observations(model.policy.deployed, normalizer, 2_000))["partial"]
+    np.testing.assert_allclose(drawn.std(axis=0), 2.0, rtol=0.1)
+    np.testing.assert_allclose(drawn.mean(axis=0), 0.0, atol=0.2)
+    of_space = draw_observations(small_model(Sampled(SEVERAL)).policy.deployed, None, 2_000)["partial"]
+    assert of_space.min() < -0.99
+    assert of_space.max() > 0.99
+
+
 def test_a_file_that_acts_otherwise_is_not_written(tmp_path):
     """Here for an encoder that branches on values, of which a file keeps the branch that the example took."""
     options = {"features_extractor_class": Branching, "net_arch": [16]}

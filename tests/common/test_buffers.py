@@ -251,6 +251,18 @@ def test_final_observations_do_not_pile_up():
     assert len(buffer._finals._times) <= 4 * 100
 
 
+def test_many_environments_end_at_once():
+    """More final observations in one step than there were before it."""
+    buffer = _make(6, 40)
+    feeder = Feeder(buffer, 40, p_end=0.9)
+    for _ in range(9):
+        feeder.step()
+    wanted = _by_id(feeder)
+    batch = buffer.sample(500)
+    for i, key in enumerate(batch.observations["partial"][:, 0].int().tolist()):
+        np.testing.assert_array_equal(batch.next_observations["partial"][i], wanted[key][2]["next"]["partial"])
+
+
 def test_too_large_a_buffer_is_refused_with_the_numbers(monkeypatch):
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 10_000}))
     with pytest.raises(MemoryError, match=r"10,000 transitions needs 0\.00 GB.*lower buffer_size to at most 222"):
