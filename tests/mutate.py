@@ -21,6 +21,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import yaml
@@ -95,11 +96,15 @@ class Mutant:
             file, *names = test.partition("[")[0].split("::")
             if not (root / file).is_file():
                 raise MutantError(f"{self.name}: there is no {file}.")
-            tree = ast.parse((root / file).read_text())
-            defined = {node.name for node in ast.walk(tree) if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
-            missing = [name for name in names if name not in defined]
+            missing = [name for name in names if name not in _names_in(root / file)]
             if missing:
                 raise MutantError(f"{self.name}: {file} has no {missing[0]}.")
+
+
+@cache
+def _names_in(path: Path) -> set[str]:
+    """Of functions and classes."""
+    return {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
 
 
 def read_mutants(paths: Iterable[Path]) -> list[Mutant]:
@@ -157,7 +162,7 @@ def _run_pytest(tree: Path, log: Path, arguments: list[str]) -> None:
     for stream in (1, 2):
         os.dup2(descriptor, stream)
     os.chdir(tree)
-    os.environ |= {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    os.environ |= {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     sys.dont_write_bytecode = True
     sys.path.insert(0, str(tree))
     for name in [name for name in sys.modules if name.partition(".")[0] in ("sb3_gac", "benchmarks", "tests")]:

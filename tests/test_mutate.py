@@ -1,10 +1,21 @@
 """The list of mutants is up to date, and the program that puts them in tells the killed from the survivors."""
 
+import multiprocessing
+
 import pytest
 
+from tests import mutate
 from tests.mutate import ROOT, Mutant, MutantError, listed_mutants, main
 
 MUTANTS = listed_mutants()
+
+
+@pytest.fixture(autouse=True)
+def _nothing_to_import_first(monkeypatch):
+    """The tests below have small projects, for which no torch needs to be imported."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([])
+    monkeypatch.setattr(mutate, "_CONTEXT", context)
 
 
 def test_every_mutant_can_be_put_in_and_its_tests_are_there():

@@ -148,6 +148,8 @@ def test_a_gradient_step_is_the_plain_one(name):
     model, envs = _model(case, settings, arguments)
     plain = PLAIN[case.cls](model.policy, settings)
     replay = PlainReplay(envs, model.get_vec_normalize_env(), case.of_model.get("n_steps", 1), settings.gamma)
+    if case.cls in (GACShare, GACWithoutQ):
+        assert "learner_critic" not in plain.networks
     before = {key: th.cat([p.detach().flatten().clone() for p in one.parameters()]) for key, one in plain.networks.items()}
     for seed in range(4):
         observations = gradient_step(model, 5 if case.cell else 16, seed)
