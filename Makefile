@@ -16,7 +16,7 @@ BIN := $(VENV)/bin
 CODE := sb3_gac benchmarks tests
 OF_EARLIER := $(if $(EARLIER),--earlier $(EARLIER))
 
-.PHONY: train test benchmark format lint type clean
+.PHONY: train test mutants benchmark format lint type clean
 
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -32,6 +32,9 @@ train: $(VENV)/.installed  ## train GAC, evaluate the learner on partial alone, 
 
 test: $(VENV)/.installed-dev  ## run the tests, several at a time
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(ARGS)
+
+mutants: $(VENV)/.installed-dev  ## would the tests notice? put in deliberate faults, one at a time
+	$(BIN)/python -m tests.mutate $(ARGS)
 
 benchmark: $(VENV)/.installed-dev  ## runs of a suite, resumed if need be, to figure, tables and page in benchmarks/results/
 	$(BIN)/python -m benchmarks.launch benchmarks/suites/$(SUITE).yml $(OF_EARLIER)

@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 from sb3_gac import GAC
@@ -153,3 +154,46 @@ def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
 def optimizers_of(policy: Any) -> list[Any]:
     """Of all its networks."""
     return [getattr(policy, name).optimizer for name in policy.flat_parameters]
+
+
+def unlike_each_other(policy: Any, scale: float = 0.4, seed: int = 0) -> None:
+    """Move every weight, targets' included: targets are unlike their critics, and stds differ between states and networks."""
+    generator = th.Generator().manual_seed(seed)
+    with th.no_grad():
+        for parameter in policy.parameters():
+            parameter.add_(scale * th.randn(parameter.shape, generator=generator))
+
+
+def gradient_step(model: Any, batch_size: int, seed: int) -> dict[str, th.Tensor]:
+    """
+    One gradient step, targets included.
+
+    :param model: that has something in its replay buffer
+    :param batch_size: transitions or sequences
+    :param seed: of all that is drawn
+    :return: observations that the replay buffer gave
+    """
+    drawn = []
+    buffer, sample = model.replay_buffer, model.replay_buffer.sample
+    buffer.sample = lambda *args, **kwargs: drawn.append(sample(*args, **kwargs)) or drawn[-1]
+    try:
+        np.random.seed(seed)
+        th.manual_seed(seed)
+        model.train(gradient_steps=1, batch_size=batch_size)
+    finally:
+        del buffer.sample
+    (samples,) = drawn
+    return samples.observations
+
+
+def noise_of_step(seed: int, n: int, shape: Any) -> th.Tensor:
+    """
+    What :func:`gradient_step` drew for the policies' actions.
+
+    :param seed: of that step
+    :param n: of actions at once
+    :param shape: of the stored actions
+    :return: shape (n, *shape)
+    """
+    th.manual_seed(seed)
+    return th.randn(n, *shape)

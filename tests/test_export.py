@@ -75,13 +75,26 @@ def _normalised_as_in_training(model, raw):
     return vec_normalize.normalize_obs(raw | {"privileged": np.zeros((len(raw["partial"]), 1))})
 
 
+def _drawn(model, n, seed):
+    """Observations of the learner; of those that are normalised, a tenth are so large that they are clipped."""
+    raw = draw_observations(model.policy.deployed, None, n, seed)
+    vec_normalize = model.get_vec_normalize_env()
+    if vec_normalize is not None:
+        raw["partial"][::10] *= 1000
+        clipped = np.abs(_normalised_as_in_training(model, raw)["partial"]) == vec_normalize.clip_obs
+        assert 0.02 < clipped.mean() < 0.2
+        assert clipped[:, 0].any()
+        assert clipped[:, 1].any()
+    return raw
+
+
 @pytest.mark.parametrize("suffix", [".onnx", ".pt"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
     """On 10,000 observations, to 1e-5 or, if discrete, but for ties; with VecNormalize, from raw observations."""
     model = KINDS[kind]().learn(60)
     path = export_learner(model, tmp_path / f"learner{suffix}")
-    raw = draw_observations(model.policy.deployed, None, 10_000, seed=1)
+    raw = _drawn(model, 10_000, seed=1)
     expected, _ = model.predict(_normalised_as_in_training(model, raw), deterministic=True)
     if suffix == ".onnx":
         actual = Learner.load(path).act(raw)
@@ -105,7 +118,7 @@ def test_a_memory_is_carried_and_reset(kind, tmp_path):
     model = WITH_MEMORY[kind]().learn(60)
     learner = Learner.load(export_learner(model, tmp_path / "learner.onnx"))
     script = th.jit.load(str(export_learner(model, tmp_path / "learner.pt")))
-    sequence = [draw_observations(model.policy.deployed, None, 500, seed=step) for step in range(20)]
+    sequence = [_drawn(model, 500, seed=step) for step in range(20)]
     for _ in range(2):
         state, scripted_state = None, th.zeros(500, learner.metadata["memory"]["size"])
         learner.reset()
@@ -168,6 +181,18 @@ def test_statistics_that_were_not_loaded_are_asked_for(tmp_path):
     assert export_learner(loaded, tmp_path / "other.onnx", normalizer).read_bytes() == expected
     loaded = GAC.load(tmp_path / "model", env=model.get_vec_normalize_env(), device="cpu")
     assert export_learner(loaded, tmp_path / "other.onnx").read_bytes() == expected
+
+
+def test_a_file_is_compared_on_what_the_policy_may_see():
+    """Normalised entries spread about their mean by twice the std, others over their space."""
+    model = small_model(_normalised()).learn(60)
+    normalizer = DeploymentNormalizer.from_vec_normalize(model.get_vec_normalize_env())
+    drawn = normalizer(draw_observations(model.policy.deployed, normalizer, 2_000))["partial"]
+    np.testing.assert_allclose(drawn.std(axis=0), 2.0, rtol=0.1)
+    np.testing.assert_allclose(drawn.mean(axis=0), 0.0, atol=0.2)
+    of_space = draw_observations(small_model(Sampled(SEVERAL)).policy.deployed, None, 2_000)["partial"]
+    assert of_space.min() < -0.99
+    assert of_space.max() > 0.99
 
 
 def test_a_file_that_acts_otherwise_is_not_written(tmp_path):

@@ -161,7 +161,7 @@ class EnvironmentGuard:
         """An info tells of an episode's end when there is one, and then of this one."""
         if len(infos) != len(dones):
             raise InvalidStepError(
-                f"{len(dones)} environments returned {len(infos)} info dicts; the step was not stored. Return one each; {GO_ON}."
+                f"{len(dones)} environments returned {len(infos)} info dicts; nothing was stored. Return one each. {GO_ON}."
             )
         for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
             if done:

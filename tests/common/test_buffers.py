@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.episodes import EpisodeReplayBuffer
 from tests.helpers import TwoViewBandit, small_model
+from tests.plain.replay import PlainReplay, Recorded
 
 SPACE = spaces.Dict(
     partial=spaces.Box(-np.inf, np.inf, (2,), np.float32),
@@ -251,20 +252,43 @@ def test_final_observations_do_not_pile_up():
     assert len(buffer._finals._times) <= 4 * 100
 
 
+def test_many_environments_end_at_once():
+    """More final observations in one step than there were before it."""
+    buffer = _make(6, 40)
+    feeder = Feeder(buffer, 40, p_end=0.9)
+    for _ in range(9):
+        feeder.step()
+    wanted = _by_id(feeder)
+    batch = buffer.sample(500)
+    for i, key in enumerate(batch.observations["partial"][:, 0].int().tolist()):
+        np.testing.assert_array_equal(batch.next_observations["partial"][i], wanted[key][2]["next"]["partial"])
+
+
 def test_too_large_a_buffer_is_refused_with_the_numbers(monkeypatch):
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 10_000}))
     with pytest.raises(MemoryError, match=r"10,000 transitions needs 0\.00 GB.*lower buffer_size to at most 222"):
         _make(10_000, 1)
 
 
-def test_works_with_vec_normalize():
-    env = VecNormalize(DummyVecEnv([lambda: TwoViewBandit(length=3)] * 2))
-    model = small_model(env, learning_starts=1000)
-    model.learn(60)
-    batch = model.replay_buffer.sample(200, env=env)
-    raw = model.replay_buffer.observations["partial"][: model.replay_buffer.pos].reshape(-1, 2)
-    expected = env.normalize_obs({"partial": raw, "privileged": np.zeros((len(raw), 1), np.float32)})["partial"]
-    assert {round(float(x), 4) for x in batch.observations["partial"][:, 0]} <= {round(float(x), 4) for x in expected[:, 0]}
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_works_with_vec_normalize(n_steps):
+    """Observations and next ones, clipped, and sums of normalised, clipped rewards, all by hand."""
+    envs = [Recorded() for _ in range(2)]
+    env = VecNormalize(DummyVecEnv([lambda env=env: env for env in envs]), clip_obs=1.3, clip_reward=0.9)
+    model = small_model(env, learning_starts=1000, n_steps=n_steps, gamma=0.8).learn(60)
+    samples = model.replay_buffer.sample(100, env=env)
+    plain = PlainReplay(envs, env, n_steps, 0.8).batch(samples.observations, sequences=False)
+    for ours, by_hand in ((samples.observations, plain.observations), (samples.next_observations, plain.next_observations)):
+        for key, value in by_hand.items():
+            np.testing.assert_allclose(ours[key], value, rtol=1e-4, atol=1e-5)
+            assert (value.abs() == 1.3).any()
+    np.testing.assert_allclose(samples.rewards[:, 0], plain.rewards, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(samples.actions, plain.actions, rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(samples.dones[:, 0], plain.terminated)
+    assert plain.rewards.abs().max() >= 0.9
+    if n_steps > 1:
+        np.testing.assert_allclose(samples.discounts[:, 0], plain.discounts, rtol=1e-5)
+        assert len(np.unique(plain.discounts)) == n_steps
 
 
 def test_is_gacs_default_and_takes_its_n_steps(tmp_path):

@@ -143,6 +143,13 @@ def test_categorical_expectations_and_losses(dtype):
     assert_close(learner_target(case["reward"], case["done"], q_learner, case["gamma"]), case["learner_target_eq15"])
 
 
+def test_kl_of_choices_has_a_direction():
+    """By hand: 0.5 log(0.5 / 0.8) + 0.5 log(0.5 / 0.2) = 0.2231, the other way round 0.1927."""
+    even, uneven = Categorical(th.tensor([[0.5, 0.5]]).log()), Categorical(th.tensor([[0.8, 0.2]]).log())
+    assert even.kl(uneven).item() == pytest.approx(0.22314, abs=1e-4)
+    assert uneven.kl(even).item() == pytest.approx(0.19274, abs=1e-4)
+
+
 def test_categorical_corrections_samples_and_modes():
     th.manual_seed(0)
     logits = th.tensor([1.0, 0.0, -1.0], requires_grad=True)

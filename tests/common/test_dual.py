@@ -57,6 +57,19 @@ def test_auto_starts_where_it_is_told(spec, value):
     assert coefficient.value.item() == pytest.approx(value)
 
 
+@pytest.mark.parametrize(("bounds", "start"), [((2.0, 8.0), 2.0), ((0.01, 0.5), 0.5), ((0.01, 8.0), 1.0)])
+def test_auto_starts_inside_its_bounds(bounds, start):
+    """At the bound that is nearest where its usual start lies outside, and the bounds stay what they are."""
+    dual = _kl_coef("auto", bounds)
+    assert dual.value.item() == pytest.approx(start)
+    assert dual.on_bound().item() == (start in bounds)
+    assert dual.bounds == bounds
+    for far_away, bound in zip((-20.0, 20.0), bounds, strict=True):
+        dual.log_value.data.fill_(far_away)
+        dual.update(th.zeros(1))
+        assert dual.value.item() == pytest.approx(bound)
+
+
 @pytest.mark.parametrize("spec", ["automatic", "auto_", "auto_x", "auto_-1", "auto_0", "none", -0.1, float("nan"), None])
 def test_bad_coefficients_are_refused_by_name(spec):
     with pytest.raises(ValueError, match="kl_coef must be"):

@@ -122,16 +122,30 @@ def test_memory_is_that_of_single_steps():
     assert recorder.buffer.nbytes() < 4 * floats * 1.1 + 10_001
 
 
-def test_normalised_by_the_environment():
-    env = VecNormalize(DummyVecEnv([TwoViewBandit]), norm_obs_keys=["partial"])
-    env.obs_rms["partial"].mean[:] = 5.0
-    recorder = Recorder(_buffer())
+@pytest.mark.parametrize("kwargs", [{}, {"sequence_length": 3, "burn_in": 1}])
+def test_normalised_by_the_environment(kwargs):
+    """Observations, the final ones as well, and rewards, by hand; entries that are not to be, are not."""
+    env = VecNormalize(DummyVecEnv([TwoViewBandit]), norm_obs_keys=["partial"], clip_obs=2.0, clip_reward=3.0)
+    env.obs_rms["partial"].mean[:], env.obs_rms["partial"].var[:] = 5.0, 4.0
+    env.ret_rms.var = np.array(9.0)
+    recorder = Recorder(_buffer(**kwargs))
     for step in range(6):
         recorder.step([TIME_LIMIT if step == 5 else NONE])
-    plain, normalised = recorder.buffer.sample(3), recorder.buffer.sample(3, env=env)
-    expected = env.normalize_obs({key: value.numpy() for key, value in plain.observations.items()})
-    th.testing.assert_close(normalised.observations["partial"], th.as_tensor(expected["partial"]).float())
+    np.random.seed(0)
+    plain = recorder.buffer.sample(8)
+    np.random.seed(0)
+    normalised = recorder.buffer.sample(8, env=env)
+    counted = (plain.observations["privileged"] > 0).float()  # padding is zeros
+    by_hand = ((plain.observations["partial"] - 5) / 2).clamp(-2, 2) * counted
+    th.testing.assert_close(normalised.observations["partial"], by_hand)
+    assert (by_hand.abs() == 2).any()
+    assert ((by_hand.abs() < 2) & (by_hand != 0)).any()
     assert th.equal(normalised.observations["privileged"], plain.observations["privileged"])
+    th.testing.assert_close(normalised.rewards, (plain.rewards / 3).clamp(-3, 3))
+    assert (normalised.rewards == 3).any()
+    assert ((normalised.rewards > 0) & (normalised.rewards < 3)).any()
+    for name in ("actions", "dones", "mask"):
+        assert th.equal(getattr(normalised, name), getattr(plain, name))
 
 
 def test_a_cut_ends_an_episode_even_where_no_observation_tells():

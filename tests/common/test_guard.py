@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
@@ -59,3 +60,11 @@ def test_training_goes_on_and_evaluation_on_full_observations_does_not():
     model.learn(20)
     with pytest.raises(ValueError, match=REFUSAL):
         evaluate_policy(model, model.get_env(), n_eval_episodes=1)
+
+
+@pytest.mark.parametrize(("norm_obs", "expected"), [(True, True), (False, False)])
+def test_a_model_remembers_whether_its_observations_were_normalised(norm_obs, expected):
+    """Rewards' normalisation alone is nothing that deployment needs."""
+    env = VecNormalize(DummyVecEnv([TwoViewBandit]), norm_obs=norm_obs)
+    assert small_model(env).learn(10).trained_normalised == expected
+    assert not small_model().learn(10).trained_normalised

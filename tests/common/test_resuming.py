@@ -1,8 +1,10 @@
 """Training 2 N steps is N, a checkpoint, another process, and N: to the bit."""
 
+import random
 import shutil
 import subprocess
 import sys
+from collections import deque
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +13,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
@@ -82,6 +85,60 @@ def test_resumed_training_is_the_uninterrupted_one(name, tmp_path):
     assert 0 < last.steps_left < 2 * N
     last.learn(last.steps_left, reset_num_timesteps=False)
     _assert_same(whole, last)
+
+
+class Succeeds(Recall):
+    """Tells whether it was done right."""
+
+    def step(self, action):
+        *result, done, truncated, info = super().step(action)
+        return *result, done, truncated, info | ({"is_success": self.np_random.random() < 0.5} if done else {})
+
+
+#: Attributes of a model that are not what training has done so far: other objects that do the same, or a process's own
+NOT_PROGRESS = {"env", "policy", "replay_buffer", "_logger", "start_time", "_vec_normalize_env", "action_noise"}
+OF_RESUMING = {"_saved_blocks", "_resumed_noise", "resumed_notes", "learn_scope", "_last_metrics", "program_key"}
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+def test_every_attribute_of_a_resumed_model_is_what_it_was(cls, tmp_path):
+    """Whatever training changes: a name that is forgotten in what is written down is found here."""
+
+    def make_env():
+        return VecNormalize(DummyVecEnv([lambda n=n: Monitor(Succeeds(n)) for n in (3, 4)]))
+
+    model = small_model(make_env(), cls, **GRU)
+    _learn_until(model, 120, 70, tmp_path)
+    resumed = cls.resume(tmp_path, make_env(), device="cpu")
+    assert len(model.ep_success_buffer) > 0
+    assert model._behaviour_state is not None
+    names = set(vars(model)) - NOT_PROGRESS - OF_RESUMING
+    assert names >= {"num_timesteps", "_n_updates", "_last_obs", "ep_info_buffer", "trained_normalised"}
+    for name in sorted(names):
+        before, after = getattr(model, name), getattr(resumed, name)
+        if _can_be_compared(before):
+            np.testing.assert_equal(_plain(after), _plain(before), err_msg=name)
+
+
+def _can_be_compared(value):
+    return isinstance(value, (int, float, str, np.ndarray, list, tuple, dict, deque, type(None)))
+
+
+def _plain(value):
+    return list(value) if isinstance(value, deque) else value
+
+
+def _draw_of_everyone(model):
+    """What each generator gives next that environments, noise, buffers and policies may draw from."""
+    return random.random(), np.random.random(), th.rand(1).item(), model.action_space.sample().item()
+
+
+def test_every_generator_goes_on_where_it_was(tmp_path):
+    model = small_model().learn(20)
+    model.save_checkpoint(tmp_path)
+    expected = _draw_of_everyone(model)
+    resumed = GAC.resume(tmp_path, TwoViewBandit(), device="cpu")
+    assert _draw_of_everyone(resumed) == expected
 
 
 class _InterruptedError(Exception):

@@ -6,10 +6,10 @@ import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, CompactDictReplayBuffer, GACShare, GACWithoutQ
-from tests.helpers import Recall
+from tests.helpers import Recall, unlike_each_other
 
 ALGORITHMS = [GAC, AsymmetricSAC]
 POLICIES = ["MultiInputGruPolicy", "MultiInputLstmPolicy"]
@@ -76,49 +76,46 @@ def test_predict_carries_its_state_and_forgets_at_an_episodes_start(continuous):
     assert state[0].shape == (1, 8)
 
 
-def test_the_guider_carries_two_states():
-    model = _model()
-    obs = {key: value[0].numpy() for key, value in _observations(1, 3).items()}
-    action, state = model.predict_guider(obs)
-    assert action.shape == (3,)
-    assert [part.shape for part in state] == [(3, 8), (3, 8)]
-    model.predict_guider(obs, state, np.zeros(3, dtype=bool))
-
-
-@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, GACShare, GACWithoutQ])
+@pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("continuous", [False, True])
-def test_padding_changes_no_loss_no_gradient_and_no_diagnostic(cls, continuous):
-    """A batch of one episode alone, and with other numbers behind its end that the mask leaves out."""
-    models = [_model(cls, env=Recall(continuous=continuous), learning_starts=1000) for _ in range(2)]
-    plain, padded = (model.learn(60) for model in models)
-    np.random.seed(0)
-    batch = plain._sample_batch(6)
-    steps = len(batch.actions)
+def test_the_guider_carries_two_states(continuous, policy):
+    """The learner's and its own, each as its network has it, and forgets both where an episode starts."""
+    model = _model(policy=policy, env=Recall(continuous=continuous))
+    unlike_each_other(model.policy)
+    first, second = ({key: value[0].numpy() for key, value in _observations(1, 3).items()} for _ in range(2))
+    begun, states = model.predict_guider(first, deterministic=True)
+    assert begun.shape == ((3, 1) if continuous else (3,))
+    assert [part.shape for part in states] == [(3, 16 if "Lstm" in policy else 8)] * 2
+    _assert_states(states, _states_after(model.policy, [first]))
+    went_on, later = model.predict_guider(second, states, np.array([False, True, False]), deterministic=True)
+    expected = _states_after(model.policy, [first, second])
+    for whole, started in zip(expected, _states_after(model.policy, [second]), strict=True):
+        whole[1] = started[1]
+    _assert_states(later, expected)
+    if continuous:
+        started, _ = model.predict_guider(second, deterministic=True)
+        np.testing.assert_allclose(went_on[1], started[1], rtol=1e-4)
+        assert (np.abs(went_on - started)[[0, 2]] > 1e-4).all()
 
-    def pad(x):
-        return th.cat([x, th.rand(3, *x.shape[1:]).to(x.dtype)])
 
-    sequence = {key: pad(value) for key, value in batch.sequence.items()}
-    longer = batch._replace(
-        observations={key: value[:-1] for key, value in sequence.items()},
-        next_observations={key: value[1:] for key, value in sequence.items()},
-        sequence=sequence,
-        actions=pad(batch.actions),
-        rewards=pad(batch.rewards),
-        dones=pad(batch.dones),
-        mask=th.cat([batch.mask, th.zeros(3, 6)]),
-    )
-    noise = th.randn(4, steps + 3, 6, 1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(th, "randn", lambda shape, **kwargs: noise[: shape[0], : shape[1]])
-        for model, one in ((plain, batch), (padded, longer)):
-            metrics = model._gradient_step(one)
-            model.metrics = {name: value.item() for name, value in metrics.items()}
-    for (name, p), q in zip(plain.policy.named_parameters(), padded.policy.parameters(), strict=True):
-        th.testing.assert_close(p, q, rtol=1e-5, atol=1e-7, msg=lambda text, name=name: f"{name}: {text}")
-    assert {"actor_std", "learner_std", "actor_max_prob", "learner_max_prob"} & set(plain.metrics)
-    for name in plain.metrics:
-        assert padded.metrics[name] == pytest.approx(plain.metrics[name], rel=1e-4, abs=1e-6), name
+def _behaving(policy):
+    """Networks whose states the behaviour policy carries."""
+    return [getattr(policy, name) for name in ("learner", "guider", "actor") if name in policy.roles.policies]
+
+
+def _states_after(policy, observations):
+    """What each network remembers of observations from an episode's start on, by one pass over all of them."""
+    sequence = {key: th.as_tensor(np.stack([obs[key] for obs in observations])) for key in observations[0]}
+    with th.no_grad():
+        return [
+            network.memory(network.extract_features(sequence, network.features_extractor))[1][0].numpy().copy()
+            for network in _behaving(policy)
+        ]
+
+
+def _assert_states(actual, expected):
+    for one, other in zip(actual, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
 
 
 def test_burn_in_brings_memories_up_and_counts_for_nothing():
@@ -183,20 +180,29 @@ def test_behind_vec_normalize():
     assert _model(env=env).learn(80)._n_updates > 0
 
 
-def test_while_collecting_the_memory_is_brought_up_and_forgets_with_each_episode():
-    model = _model(env=make_vec_env(Recall, 2, seed=0), learning_starts=8)
-    seen = []
-    behave = model.policy.behaviour_action
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("cls", [GAC, GACShare, GACWithoutQ, AsymmetricSAC])
+def test_while_collecting_the_memory_is_brought_up_and_forgets_with_each_episode(cls, policy):
+    """After every step, in warm-up as well, each network remembers its episode so far, and nothing of the one before."""
+    lengths = (3, 5)
+    model = _model(cls, policy, DummyVecEnv([lambda n=n: Recall(n, continuous=True) for n in lengths]), learning_starts=8)
+    unlike_each_other(model.policy)
+    behave, steps = model.policy.behaviour_action, []
 
-    def spy(observation, state, episode_start, deterministic=False):
-        seen.append((state, np.array(episode_start)))
-        return behave(observation, state, episode_start, deterministic)
+    def spy(observation, *args, **kwargs):
+        action, state = behave(observation, *args, **kwargs)
+        steps.append((observation, [part.copy() for part in state]))
+        return action, state
 
     model.policy.behaviour_action = spy
+    model.train = lambda *args, **kwargs: None  # the networks stay what they are
     model.learn(24)
-    assert len(seen) == 12, "in warm-up as well"
-    assert seen[0][0] is None
-    assert [starts.tolist() for _, starts in seen] == [[step % 4 == 0] * 2 for step in range(12)]
+    assert len(steps) == 12
+    for env, length in enumerate(lengths):
+        for step, (_, states) in enumerate(steps):
+            so_far = [steps[before][0] for before in range(step - step % length, step + 1)]
+            of_env = [{key: value[[env]] for key, value in obs.items()} for obs in so_far]
+            _assert_states([part[[env]] for part in states], _states_after(model.policy, of_env))
 
 
 def test_whole_episodes_can_be_the_unit_of_training():

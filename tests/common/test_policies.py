@@ -1,0 +1,54 @@
+"""What networks are made of: targets, encoders, sizes."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_gac import GAC, AsymmetricSAC, GACShare
+from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice, small_model
+
+IMAGE = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=spaces.Box(-1, 1, (2,), np.float32))
+CNN = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}, "share_features_extractor": True}
+ALGORITHMS = pytest.mark.parametrize("cls", [GAC, GACShare, AsymmetricSAC])
+
+
+def _same(one, other):
+    return all(th.equal(p, q) for p, q in zip(one.parameters(), other.parameters(), strict=True))
+
+
+@ALGORITHMS
+@pytest.mark.parametrize("env", [TwoViewBandit, TwoViewChoice])
+def test_targets_start_as_their_critics_and_stay_until_they_are_averaged(cls, env):
+    policy = small_model(env(), cls).policy
+    for critic, target in policy.critic_pairs.values():
+        assert _same(critic, target)
+        members = next(iter(critic.parameters()))
+        assert not th.equal(members[0], members[1]), "two critics, not one twice"
+        with th.no_grad():
+            for parameter in critic.parameters():
+                parameter.add_(1.0)
+        before = [parameter.clone() for parameter in target.parameters()]
+        policy.update_targets(0.25)
+        for p, was in zip(target.parameters(), before, strict=True):
+            th.testing.assert_close(p, was + 0.25)
+
+
+@ALGORITHMS
+def test_a_targets_encoder_is_its_own_where_the_learners_is_shared(cls):
+    """Or the target would follow the learner's loss at once, and not by averaging."""
+    policy = small_model(Sampled(IMAGE), cls, policy_kwargs=CNN).policy
+    of_deployed = {id(parameter) for parameter in policy.deployed.parameters()}
+    for critic, target in policy.critic_pairs.values():
+        assert of_deployed & {id(parameter) for parameter in critic.parameters()}
+        assert not of_deployed & {id(parameter) for parameter in target.parameters()}
+        assert _same(critic, target)
+
+
+@ALGORITHMS
+def test_policies_and_critics_may_differ_in_size(cls):
+    policy = small_model(cls=cls, policy_kwargs={"net_arch": {"pi": [8], "qf": [4, 5]}}).policy
+    assert policy.deployed.net_arch == [8]
+    assert [critic.net_arch for pair in policy.critic_pairs.values() for critic in pair] == [[4, 5]] * 2 * len(
+        policy.critic_pairs
+    )
