@@ -20,7 +20,15 @@ from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.flat import FlatAdam, FlatParameters
 from sb3_gac.common.memory import Memory
 from sb3_gac.common.networks import CriticEnsemble, DiscreteCriticEnsemble, VectorExtractor, polyak_average, trainable
-from sb3_gac.common.roles import RoleKeys, Roles, resolve_lr_scales, resolve_net_arch, resolve_role_keys, role_space
+from sb3_gac.common.roles import (
+    DEFAULT_NET_ARCH,
+    RoleKeys,
+    Roles,
+    resolve_lr_scales,
+    resolve_net_arch,
+    resolve_role_keys,
+    role_space,
+)
 
 #: What each network of a behaviour policy remembers, shapes (B, S); ``None`` without memories, and before the first step
 BehaviourState: TypeAlias = tuple[np.ndarray, ...] | None
@@ -86,8 +94,9 @@ class AsymmetricPolicy(BasePolicy):
         )
         check_integer("n_critics", n_critics, 1)
         check_integer("rnn_hidden_size", rnn_hidden_size, 1)
+        self.net_arch = list(DEFAULT_NET_ARCH) if net_arch is None else net_arch
         self.constructor_options: dict[str, Any] = {
-            "net_arch": net_arch,
+            "net_arch": self.net_arch,
             "activation_fn": activation_fn,
             "role_keys": role_keys,
             "lr_scales": lr_scales,
@@ -96,11 +105,10 @@ class AsymmetricPolicy(BasePolicy):
             "rnn_hidden_size": rnn_hidden_size,
             "rnn_net_arch": list(rnn_net_arch),
         }
-        self.net_arch = net_arch
         self.n_critics = n_critics
         self.share_features_extractor = share_features_extractor
         self.role_keys = resolve_role_keys(observation_space, self.roles, role_keys)
-        self._role_net_arch = resolve_net_arch(self.roles, net_arch)
+        self._role_net_arch = resolve_net_arch(self.roles, self.net_arch)
 
     # --- networks ---------------------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_gac.common.actors import RolePolicy
 from sb3_gac.common.compilation import Program, Staged, StagedProgram, compilable_in_stages
 from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.divergence import check_finite_metrics
@@ -45,16 +46,16 @@ class Batch(NamedTuple):
     sequence: PyTorchObs | None = None
     mask: th.Tensor | None = None
 
-    def outputs(self, policy: Callable[[Any], Any]) -> tuple[Any, Any]:
+    def outputs(self, policy: RolePolicy) -> tuple[Any, Any]:
         """
-        :param policy: observations -> distribution
-        :return: on the observations, and, as a constant, on the next ones; of sequences in one pass over time
+        :param policy: a policy's network
+        :return: its distribution for the observations, and, as a constant, for the next ones; for sequences in one pass
         """
         if self.sequence is None:
-            now = policy(self.observations)
+            now = policy.distribution(self.observations)
             with th.no_grad():
-                return now, policy(self.next_observations)
-        both = policy(self.sequence)
+                return now, policy.distribution(self.next_observations)
+        both: Any = policy.distribution(self.sequence)
         return type(both)(*(part[:-1] for part in both)), type(both)(*(part[1:].detach() for part in both))
 
     @th.no_grad()
