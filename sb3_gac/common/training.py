@@ -155,7 +155,8 @@ class NetworkTraining(FaultTolerance):
         self.policy.set_training_mode(True)
         self.policy.refresh_parameters()
         self._update_learning_rate(self._scheduled_optimizers())
-        self.program_key = (batch_size, self.policy, *(getattr(self, name) for name in self.compiled_settings))
+        settings = (getattr(self, name) for name in self.compiled_settings)
+        self.program_key = (batch_size, self.policy, self.policy.frozen, *settings)
         self._halves_together = self._halves_are_independent and th.get_num_threads() > 1
         with halved_threads(self._halves_together):
             history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
@@ -235,8 +236,10 @@ class NetworkTraining(FaultTolerance):
         :param descent: of that network
         :return: its metrics
         """
-        self.policy.flat_parameters[name].flat.grad = descent.gradient
-        getattr(self.policy, name).optimizer.step()
+        flat_parameters = self.policy.flat_parameters[name]
+        if flat_parameters.parameters:  # unless all are frozen
+            flat_parameters.flat.grad = descent.gradient
+            getattr(self.policy, name).optimizer.step()
         return descent.metrics
 
     @abstractmethod
