@@ -77,7 +77,7 @@ class DeployedModule(nn.Module):
         """
         obs = {key: self._normalize(key, value) for key, value in zip(self.keys, inputs, strict=False)}
         if self.memory is None:
-            return self._in_range(self.policy(obs).mode)
+            return self._in_range(self.policy.distribution(obs).mode)
         features = self.policy.extract_features(
             {key: value[None] for key, value in obs.items()}, self.policy.features_extractor
         )

@@ -104,7 +104,7 @@ def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
         assert [entry["name"] for entry in json.loads(extra["sb3_gac"])["entries"]] == list(raw)
     assert actual.shape == expected.shape
     if kind == "discrete":
-        logits = model.policy.deployed(model.policy.obs_to_tensor(raw)[0]).logits.detach()
+        logits = model.policy.deployed.distribution(model.policy.obs_to_tensor(raw)[0]).logits.detach()
         first, second = logits.topk(2).values.T.numpy()
         assert (actual == expected)[first - second > 1e-5].all()
         assert (first - second > 1e-5).mean() > 0.99

@@ -166,7 +166,7 @@ def check_gradient(model, tmp_path):
     obs = {key: value.float().requires_grad_() for key, value in model.policy.obs_to_tensor(_sequence(model)[0])[0].items()}
     inputs = obs if model.policy.cell is None else {key: value[None] for key, value in obs.items()}
     model.policy.set_training_mode(False)
-    total = sum(value.sum() for value in model.policy.deployed(inputs))
+    total = sum(value.sum() for value in model.policy.deployed.distribution(inputs))
     sources = [*obs.values(), *_parameters_of_others(model)]
     by_entry = dict(zip(obs, th.autograd.grad(total, sources, allow_unused=True)[: len(obs)], strict=True))
     assert by_entry["partial"].abs().sum() > 0

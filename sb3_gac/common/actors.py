@@ -66,10 +66,23 @@ class RolePolicy(RoleModel, BasePolicy):
         latent_dim = net_arch[-1] if net_arch else features_dim
         self.head = make_head(latent_dim, action_space, log_std_bounds)
 
-    def forward(self, obs: PyTorchObs) -> Distribution:
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """
+        Actions, as from the actor of SB3's SAC: samples of a Gaussian are differentiable.
+
+        :param obs: observation with at least the entries of this role, (B, ...) of each; for a policy with a memory, those
+            of an episode's first step
+        :param deterministic: mode instead of a sample
+        :return: actions in [-1, 1], shape (B, A), or numbers of actions, shape (B,)
+        """
+        return self._predict(obs, deterministic)
+
+    def distribution(self, obs: PyTorchObs) -> Distribution:
         r"""
+        What the network computes; with a memory, of sequences from an episode's start on.
+
         :param obs: observation with at least the entries of this role, (\*E, ...) of each
-        :return: of actions, or of what makes them, shapes (\*E, A)
+        :return: distribution of actions, or of what makes them, shapes (\*E, A)
         """
         return self.output(self.latent(obs))
 
@@ -84,7 +97,7 @@ class RolePolicy(RoleModel, BasePolicy):
     def output(self, latent: th.Tensor) -> Distribution:
         r"""
         :param latent: shape (\*E, H)
-        :return: see :meth:`forward`
+        :return: see :meth:`distribution`
         """
         return self.head(latent)
 
@@ -97,16 +110,16 @@ class RolePolicy(RoleModel, BasePolicy):
         :param obs: observation with at least the entries of this role, (B, ...) of each
         :param state: what was remembered before, shape (B, S), or ``None``
         :param episode_start: true where an episode starts, shape (B,)
-        :return: as of :meth:`forward`, shapes (B, A), and what is remembered now; ``None`` without a memory
+        :return: as of :meth:`distribution`, shapes (B, A), and what is remembered now; ``None`` without a memory
         """
         if self.memory is None:
-            return self(obs), None
+            return self.distribution(obs), None
         assert isinstance(obs, dict)
         one_step = {key: value[None] for key, value in obs.items()}
         features = self.extract_features(one_step, self.features_extractor)
         before = self.memory.state_before(state, episode_start, features.shape[1])  # type: ignore[operator]
         outputs, after = self.memory(features, before)
-        return self.output(self.latent_net(outputs[0, 0])), after[0].cpu().numpy()
+        return self.output(self.latent_net(outputs[0, 0])), after[0].detach().cpu().numpy()
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {

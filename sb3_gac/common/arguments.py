@@ -1,5 +1,6 @@
 """Checks of the constructor arguments that all our off-policy algorithms have; see :mod:`sb3_gac.common.checks`."""
 
+import inspect
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -10,6 +11,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
+from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_gac.common.checks import (
     check_choice,
@@ -19,10 +21,45 @@ from sb3_gac.common.checks import (
     check_positive,
     check_schedule,
     check_type,
+    plain,
 )
 
 LARGEST_SEED = 2**32 - 1
 SWITCHES = ("optimize_memory_usage", "compile", "mixed_precision")
+#: Argument -> SB3's attribute, where it is called otherwise
+KEPT_AS = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
+#: What is handed on to classes that may be the user's own, with all arrays that they may take
+HANDED_ON = ("policy_kwargs", "replay_buffer_kwargs")
+
+
+class PlainSchedule(FloatSchedule):
+    """A schedule of Python's numbers, whatever its function returns: numpy's, torch's, or arrays of one."""
+
+    def __call__(self, progress_remaining: float) -> float:
+        """
+        :param progress_remaining: from 1 to 0
+        """
+        return float(plain(self.value_schedule(progress_remaining), arrays=True))
+
+
+def constructor_arguments(algorithm: type) -> list[str]:
+    """
+    :param algorithm: a class
+    :return: names of the arguments that are kept with a model, as the attribute of that name or as :data:`KEPT_AS` says
+    """
+    return [name for name in inspect.signature(algorithm).parameters if name not in ("env", "device", "_init_setup_model")]
+
+
+def make_arguments_plain(model: OffPolicyAlgorithm) -> None:
+    """
+    Python's numbers in all arguments, see :func:`plain`.
+
+    :param model: whose attributes are the arguments
+    """
+    for argument in constructor_arguments(type(model)):
+        name = KEPT_AS.get(argument, argument)
+        if name in vars(model):
+            vars(model)[name] = plain(vars(model)[name], arrays=argument not in HANDED_ON)
 
 
 def check_what_construction_needs(device: Any, verbose: Any) -> None:
@@ -59,7 +96,6 @@ def check_shared_arguments(model: OffPolicyAlgorithm) -> None:
     check_integer("stats_window_size", model._stats_window_size, 1)
     if model.seed is not None:
         check_integer("seed", model.seed, 0, LARGEST_SEED, remedy="or None")
-        model.seed = int(model.seed)  # Python's generator takes no integer of numpy's
     if values["max_grad_norm"] is not None:
         check_positive("max_grad_norm", values["max_grad_norm"], remedy="or None for no clipping")
     for name in SWITCHES:

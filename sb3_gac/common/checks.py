@@ -6,6 +6,7 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 
@@ -35,6 +36,32 @@ def described(error: Exception) -> str:
 
 
 # --- arguments ----------------------------------------------------------------------------------------------------------
+
+
+def plain(value: Any, arrays: bool = False) -> Any:
+    """
+    Python's own numbers in place of numpy's and torch's, also inside of dicts, lists and tuples.
+
+    Files that hold others can't be read without executing what they say.
+
+    :param value: anything
+    :param arrays: whether arrays with dimensions become a number, if they hold one, or lists; if not, they stay as they are
+    :return: the same, of Python's numbers
+    """
+    if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
+        number = value.item()
+        return float(number) if isinstance(number, np.floating) else number  # a long double's item is a long double
+    if arrays and isinstance(value, (np.ndarray, th.Tensor)):
+        numbers = value.tolist()
+        return value.item() if np.size(numbers) == 1 else numbers
+    if isinstance(value, Mapping):
+        return {plain(key): plain(part, arrays) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        parts = [plain(part, arrays) for part in value]
+        if isinstance(value, list):
+            return parts
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value
 
 
 def check_positive(name: str, value: Any, remedy: str = "") -> None:
@@ -117,7 +144,7 @@ def check_schedule(name: str, value: Any, remedy: str = "or a schedule", may_be_
         (check_not_negative if may_be_zero else check_positive)(name, value, remedy)
         return
     for progress_remaining, when in ((1.0, "start"), (0.0, "end")):
-        check_not_negative(f"{name} at the {when} of training", value(progress_remaining))
+        check_not_negative(f"{name} at the {when} of training", plain(value(progress_remaining), arrays=True))
 
 
 # --- spaces and what environments return --------------------------------------------------------------------------------

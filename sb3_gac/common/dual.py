@@ -27,6 +27,9 @@ class FixedCoefficient:
         """Nothing to learn, and no loss."""
         return {}
 
+    def go_on_from(self, other: "Coefficient") -> None:
+        """It is what it was told to be."""
+
     def on_bound(self) -> th.Tensor:
         """It has none: zero."""
         return th.zeros_like(self.value)
@@ -55,6 +58,21 @@ class DualVariable:
     def value(self) -> th.Tensor:
         """The coefficient, detached, scalar."""
         return self.log_value.detach().exp().squeeze(0)
+
+    def go_on_from(self, other: "Coefficient") -> None:
+        """
+        Take over another one's value, inside the own bounds, and what its optimiser has gathered, at the own learning rate.
+
+        :param other: learned as well
+        """
+        assert isinstance(other, DualVariable)
+        assert self.optimizer is not None
+        assert other.optimizer is not None
+        learning_rate = self.optimizer.param_groups[0]["lr"]
+        with th.no_grad():
+            self.log_value.copy_(other.log_value).clamp_(*self._log_bounds)
+        self.optimizer.load_state_dict(other.optimizer.state_dict())
+        self.optimizer.param_groups[0]["lr"] = learning_rate
 
     def on_bound(self) -> th.Tensor:
         """1 if the coefficient sits on one of its bounds, else 0, scalar."""
@@ -107,7 +125,9 @@ def make_coefficient(
         return FixedCoefficient(_parse(spec, remedy, allow_zero=True), device)
     initial = auto_value if spec == "auto" else _parse(spec.removeprefix("auto_"), remedy, allow_zero=False)
     if spec != "auto" and not low <= initial <= high:
-        raise ValueError(f"The start value of {name}={spec!r} lies outside {name}_bounds={bounds}.")
+        raise ValueError(
+            f'The start value of {name}={spec!r} lies outside {name}_bounds={bounds}: give another one, or {name}="auto".'
+        )
     return DualVariable(name, min(max(initial, low), high), (low, high), learning_rate, device)
 
 

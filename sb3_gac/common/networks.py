@@ -1,7 +1,7 @@
 """Building blocks of the policies: an ensemble of Q-networks evaluated at once."""
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,16 +12,6 @@ from stable_baselines3.common.preprocessing import get_action_dim, preprocess_ob
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
-
-
-def trainable(parameters: Iterable[nn.Parameter], but: Iterable[nn.Parameter] = ()) -> list[nn.Parameter]:
-    """
-    :param parameters: of a network; parts of an encoder may be frozen
-    :param but: those that belong to another network
-    :return: those that the network's optimiser may change
-    """
-    others = {id(parameter) for parameter in but}
-    return [parameter for parameter in parameters if parameter.requires_grad and id(parameter) not in others]
 
 
 class VectorExtractor(BaseFeaturesExtractor):

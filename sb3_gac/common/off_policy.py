@@ -1,23 +1,34 @@
 """What off-policy algorithms with a privileged view share: arguments, their checks, acting and save lists."""
 
+from collections import deque
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self
 
-from sb3_gac.common.arguments import check_shared_arguments, check_what_construction_needs
+from sb3_gac.common.arguments import (
+    KEPT_AS,
+    PlainSchedule,
+    check_shared_arguments,
+    check_what_construction_needs,
+    make_arguments_plain,
+)
 from sb3_gac.common.buffers import CompactDictReplayBuffer
+from sb3_gac.common.checks import plain
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
 from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_sequences
 from sb3_gac.common.guard import DeploymentGuard
 from sb3_gac.common.heads import check_action_space, resolve_target_entropy
+from sb3_gac.common.overrides import algorithm_of
 from sb3_gac.common.parallel import has_side_effects
 from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
 from sb3_gac.common.resuming import ResumableAlgorithm
@@ -25,6 +36,8 @@ from sb3_gac.common.roles import RoleKeys, resolve_lr_scales, resolve_role_keys
 
 ENT_COEF_START = 0.1
 ENT_COEF_BOUNDS = (1e-8, 1e4)
+#: Options of our replay buffers that say how to sample, not what is stored
+SAMPLING_OPTIONS = ("n_steps", "gamma", "sequence_length", "burn_in")
 
 
 class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
@@ -72,6 +85,8 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
+    #: Arguments that files hold results of: given to ``load`` or ``resume``, they count once those are restored
+    restored_arguments: ClassVar[tuple[str, ...]] = ("ent_coef", "lr_scales", "stats_window_size")
     policy_class: type[AsymmetricPolicy]
     policy: AsymmetricPolicy
 
@@ -155,15 +170,24 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
             )
         return self.policy_aliases[policy_name]
 
+    def _setup_lr_schedule(self) -> None:
+        self.lr_schedule = PlainSchedule(self.learning_rate)
+
     def _setup_model(self) -> None:
+        make_arguments_plain(self)
         self._check_arguments()
+        self.algorithm = algorithm_of(type(self))  # so that a file says whose it is
         if self.replay_buffer_class is None:
             self.replay_buffer_class = CompactDictReplayBuffer if self.policy_class.cell is None else EpisodeReplayBuffer
-        as_given = {name: getattr(self, name) for name in ("policy_kwargs", "replay_buffer_kwargs", "n_steps")}
-        self.policy_kwargs = {**self._policy_options(), **self.policy_kwargs}
+        self._fit_action_noise()
+        if self.replay_buffer is None and self.env is not None:  # to act takes no memory for training
+            self.replay_buffer = self._make_replay_buffer()
+        as_given = {name: getattr(self, name) for name in ("policy_kwargs", "n_steps", "replay_buffer")}
+        self.policy_kwargs = self._all_policy_kwargs()
         if issubclass(self.replay_buffer_class, CompactDictReplayBuffer):
-            self.replay_buffer_kwargs = {"n_steps": self.n_steps, "gamma": self.gamma, **self.replay_buffer_kwargs}
-            self.n_steps = 1  # SB3 warns that it can't pass n_steps on to this buffer: it just was
+            self.n_steps = 1  # SB3 warns that it can't pass n_steps on to this buffer: it was
+        if self.replay_buffer is None:
+            self.replay_buffer = object()  # type: ignore[assignment]  # SB3 would make one
         try:
             super()._setup_model()
         finally:
@@ -195,6 +219,38 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         if self.policy_class.cell is not None:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
+
+    def _make_replay_buffer(self) -> ReplayBuffer:
+        assert self.replay_buffer_class is not None
+        options = self._replay_buffer_options()
+        if issubclass(self.replay_buffer_class, HerReplayBuffer):
+            options["env"] = self.env
+        return self.replay_buffer_class(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            optimize_memory_usage=self.optimize_memory_usage,
+            **options,
+        )
+
+    def _replay_buffer_options(self) -> dict[str, Any]:
+        """Arguments of the replay buffer's class, those that are arguments of the algorithm included."""
+        assert self.replay_buffer_class is not None
+        ours = issubclass(self.replay_buffer_class, CompactDictReplayBuffer)
+        return {**({"n_steps": self.n_steps, "gamma": self.gamma} if ours else {}), **self.replay_buffer_kwargs}
+
+    def _fit_action_noise(self) -> None:
+        """Noise that SB3 has made for another number of environments becomes noise for as many as there are."""
+        noise = self.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:
+            base = deepcopy(noise.base_noise)
+            base.reset()
+            self.action_noise = VectorizedActionNoise(base, self.n_envs) if self.n_envs > 1 else base
+
+    def _all_policy_kwargs(self) -> dict[str, Any]:
+        return {**self._policy_options(), **self.policy_kwargs}
 
     def _policy_options(self) -> dict[str, Any]:
         """Arguments of the policy class that are arguments of the algorithm."""
@@ -288,6 +344,48 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     # --- save and load ----------------------------------------------------------------------------------------------
+
+    def get_parameters(self) -> dict[str, dict]:
+        """See SB3's ``get_parameters``: optimisers' options are Python's numbers, whatever a schedule or a callback left."""
+        self.policy.refresh_parameters()
+        parameters = super().get_parameters()
+        for name, state in parameters.items():
+            if "optim" in name:
+                state["param_groups"] = plain(state["param_groups"], arrays=True)
+        return parameters
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """See SB3's ``load_replay_buffer``; how the buffer is sampled is the model's to say, not the file's."""
+        super().load_replay_buffer(path, truncate_last_traj)
+        if isinstance(self.replay_buffer, CompactDictReplayBuffer):
+            options = self._replay_buffer_options()
+            given = {name: options[name] for name in SAMPLING_OPTIONS if name in options and hasattr(self.replay_buffer, name)}
+            vars(self.replay_buffer).update(given)
+
+    def _change_arguments(self, given: dict[str, Any]) -> None:
+        """
+        :param given: some of ``restored_arguments``; they take the place of what was restored. A coefficient that is learned
+            before and after goes on from where it was, unless it is given a start value
+        """
+        if not given:
+            return
+        before = {name: (getattr(self, name.removesuffix("_dual")), getattr(self, name)) for name in self._dual_names()}
+        vars(self).update({KEPT_AS.get(name, name): value for name, value in given.items()})
+        make_arguments_plain(self)
+        self._check_arguments()
+        self._setup_coefficients()
+        for name, (spec, coefficient) in before.items():
+            argument = name.removesuffix("_dual")
+            spec_now = getattr(self, argument)
+            if not any(other.startswith(argument) for other in given):
+                setattr(self, name, coefficient)
+            elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, DualVariable)):
+                getattr(self, name).go_on_from(coefficient)
+        if "lr_scales" in given:
+            self.policy.scale_learning_rates(self._all_policy_kwargs()["lr_scales"])
+        for buffer in ("ep_info_buffer", "ep_success_buffer"):
+            if getattr(self, buffer) is not None:
+                setattr(self, buffer, deque(getattr(self, buffer), maxlen=self._stats_window_size))
 
     def _dual_names(self) -> list[str]:
         """Attributes that hold coefficients."""

@@ -17,10 +17,18 @@ from torch import nn
 from sb3_gac.common.actors import DeployedPolicy
 from sb3_gac.common.checks import check_integer
 from sb3_gac.common.distributions import Distribution
-from sb3_gac.common.flat import FlatAdam, FlatParameters
+from sb3_gac.common.flat import FlatAdam, FlatParameters, TrainedParameters
 from sb3_gac.common.memory import Memory
-from sb3_gac.common.networks import CriticEnsemble, DiscreteCriticEnsemble, VectorExtractor, polyak_average, trainable
-from sb3_gac.common.roles import RoleKeys, Roles, resolve_lr_scales, resolve_net_arch, resolve_role_keys, role_space
+from sb3_gac.common.networks import CriticEnsemble, DiscreteCriticEnsemble, VectorExtractor, polyak_average
+from sb3_gac.common.roles import (
+    DEFAULT_NET_ARCH,
+    RoleKeys,
+    Roles,
+    resolve_lr_scales,
+    resolve_net_arch,
+    resolve_role_keys,
+    role_space,
+)
 
 #: What each network of a behaviour policy remembers, shapes (B, S); ``None`` without memories, and before the first step
 BehaviourState: TypeAlias = tuple[np.ndarray, ...] | None
@@ -86,8 +94,9 @@ class AsymmetricPolicy(BasePolicy):
         )
         check_integer("n_critics", n_critics, 1)
         check_integer("rnn_hidden_size", rnn_hidden_size, 1)
+        self.net_arch = list(DEFAULT_NET_ARCH) if net_arch is None else net_arch
         self.constructor_options: dict[str, Any] = {
-            "net_arch": net_arch,
+            "net_arch": self.net_arch,
             "activation_fn": activation_fn,
             "role_keys": role_keys,
             "lr_scales": lr_scales,
@@ -96,11 +105,10 @@ class AsymmetricPolicy(BasePolicy):
             "rnn_hidden_size": rnn_hidden_size,
             "rnn_net_arch": list(rnn_net_arch),
         }
-        self.net_arch = net_arch
         self.n_critics = n_critics
         self.share_features_extractor = share_features_extractor
         self.role_keys = resolve_role_keys(observation_space, self.roles, role_keys)
-        self._role_net_arch = resolve_net_arch(self.roles, net_arch)
+        self._role_net_arch = resolve_net_arch(self.roles, self.net_arch)
 
     # --- networks ---------------------------------------------------------------------------------------------------
 
@@ -172,17 +180,19 @@ class AsymmetricPolicy(BasePolicy):
         :param unclipped: how many of the deployed policy's last parameters have no say in the clipping of its gradient
         """
         deployed = list(self.deployed.parameters())  # with a shared encoder, whoever else holds it
-        self.flat_parameters = {self.roles.deployed: FlatParameters(trainable(deployed), unclipped)}
+        self.flat_parameters = {self.roles.deployed: TrainedParameters(deployed, unclipped)}
+        of_deployed = {id(parameter) for parameter in deployed}
         for role in self.roles.others:
             if getattr(self, role) is not None:
-                self.flat_parameters[role] = FlatParameters(trainable(getattr(self, role).parameters(), but=deployed))
+                own = [parameter for parameter in getattr(self, role).parameters() if id(parameter) not in of_deployed]
+                self.flat_parameters[role] = TrainedParameters(own)
         optimizer_class, kwargs = self.optimizer_class, dict(self.optimizer_kwargs)
         if "foreach" not in kwargs and kwargs.get("fused", True):
             optimizer_class = FlatAdam if optimizer_class is th.optim.Adam else optimizer_class
             kwargs |= {"fused": True} if issubclass(optimizer_class, (th.optim.Adam, th.optim.AdamW)) else {}
         lr_scales = resolve_lr_scales(self.roles, self.constructor_options["lr_scales"])
         for role, parameters in self.flat_parameters.items():
-            group = {"params": [parameters.flat], "lr_scale": lr_scales[role]}
+            group = {"params": [parameters.flat], "lr_scale": lr_scales[role], "trained": parameters.trained}
             getattr(self, role).optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore
         self._collect_targets()
 
@@ -201,9 +211,38 @@ class AsymmetricPolicy(BasePolicy):
         self._has_statistics = any(get_parameters_by_name(critic, ["running_"]) for critic, _ in self.critic_pairs.values())
 
     def refresh_parameters(self) -> None:
-        """To be called before training: see :meth:`FlatParameters.refresh`."""
-        for parameters in (*self.flat_parameters.values(), *self._flat_targets):
-            parameters.refresh()
+        """
+        To be called before training and before saving: parameters that have been frozen, unfrozen, moved or replaced.
+
+        See :meth:`TrainedParameters.follow` and :meth:`FlatParameters.refresh`.
+        """
+        before = self.frozen
+        for role, parameters in self.flat_parameters.items():
+            parameters.follow(getattr(self, role).optimizer)
+        if self.frozen != before:
+            self._collect_targets()
+        for flat in (*self.flat_parameters.values(), *self._flat_targets):
+            flat.refresh()
+
+    @property
+    def frozen(self) -> tuple[tuple[str, int], ...]:
+        """Role and number of each parameter that is not trained, after :meth:`refresh_parameters`."""
+        flat_parameters = self.flat_parameters.items()
+        return tuple((role, i) for role, flat in flat_parameters for i, trained in enumerate(flat.trained) if not trained)
+
+    def freeze_as_saved(self) -> None:
+        """To be called when a file has given the optimisers their state: see :meth:`TrainedParameters.freeze_as_in`."""
+        for role, parameters in self.flat_parameters.items():
+            parameters.freeze_as_in(getattr(self, role).optimizer)
+
+    def scale_learning_rates(self, lr_scales: Mapping[str, float] | None) -> None:
+        """
+        :param lr_scales: network -> multiple of the learning rate, in place of those that there were
+        """
+        self.constructor_options["lr_scales"] = lr_scales
+        for role, scale in resolve_lr_scales(self.roles, lr_scales).items():
+            if role in self.flat_parameters:
+                getattr(self, role).optimizer.param_groups[0]["lr_scale"] = scale
 
     def flat_tensors(self) -> list[th.Tensor]:
         """Those that parameters are views of, after :meth:`refresh_parameters`."""

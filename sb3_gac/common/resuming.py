@@ -1,6 +1,5 @@
 """Checkpoints of all that training depends on, from which another process goes on as if there had been no interruption."""
 
-import inspect
 import io
 import json
 import random
@@ -18,6 +17,7 @@ from stable_baselines3.common.save_util import recursive_getattr, recursive_seta
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
 from typing_extensions import Self
 
+from sb3_gac.common.arguments import KEPT_AS, constructor_arguments
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.checkpoint_files import (
     CheckpointError,
@@ -28,6 +28,8 @@ from sb3_gac.common.checkpoint_files import (
     write_block,
     write_checkpoint,
 )
+from sb3_gac.common.faults import networks_named
+from sb3_gac.common.overrides import SETTINGS, check_names, check_unchanged
 from sb3_gac.common.serialization import UntrustedNameError, decode, encode
 from sb3_gac.common.training import NetworkTraining
 from sb3_gac.common.vec_state import restore_vec_env_state, vec_env_state
@@ -52,7 +54,8 @@ PROGRESS = (
     "strict_deployment",
     "trained_normalised",
 )
-_KEPT_AS = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}  # argument -> SB3's attribute
+#: Arguments that what a checkpoint holds was made with
+FIXED = ("policy", "policy_kwargs", "buffer_size", "replay_buffer_class")
 _STATE, _ARRAYS, _TENSORS = "state.json", "arrays.npz", "tensors.pt"
 
 
@@ -107,6 +110,8 @@ class ResumableAlgorithm(NetworkTraining):
         :raises TypeError: if the replay buffer is of another class than this package's
         """
         buffer = self.replay_buffer
+        if buffer is None:
+            raise TypeError("There is no replay buffer to write down: set_env() gives one to a model that was loaded without.")
         if not isinstance(buffer, CompactDictReplayBuffer):
             raise TypeError(
                 f"A checkpoint can hold a CompactDictReplayBuffer or a subclass, but replay_buffer_class is "
@@ -156,10 +161,8 @@ class ResumableAlgorithm(NetworkTraining):
     def _encoded_arguments(self, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         """Of the constructor, as far as they can be written down; of the others, what can't be."""
         arguments: dict[str, Any] = {}
-        for name in inspect.signature(type(self)).parameters:
-            if name in ("env", "device", "_init_setup_model"):
-                continue
-            value = getattr(self, _KEPT_AS.get(name, name))
+        for name in constructor_arguments(type(self)):
+            value = getattr(self, KEPT_AS.get(name, name))
             if isinstance(value, TrainFreq):
                 value = (value.frequency, value.unit.value)
             try:
@@ -197,11 +200,13 @@ class ResumableAlgorithm(NetworkTraining):
         :param directory: of :meth:`save_checkpoint`
         :param env: made like the one before
         :param device: may be another one
-        :param given: arguments of the constructor; needed are those that no file can hold, such as functions and classes
-            of your own
+        :param given: arguments of the constructor, which take the place of those before, and ``strict_deployment``; needed
+            are those that no file can hold, such as functions and classes of your own
         :return: the model as it was
         :raises CheckpointError: if no checkpoint is whole, or it is of another algorithm
-        :raises ValueError: naming a needed argument, or the entry of a space that is another one now
+        :raises TypeError: naming what is no argument
+        :raises ValueError: naming a needed argument, one that can't be changed, or the entry of a space that is another one
+            now
         """
         root = Path(directory).absolute()
         path, files = latest_whole(root)
@@ -210,15 +215,33 @@ class ResumableAlgorithm(NetworkTraining):
             raise CheckpointError(f"{path} is of {state['algorithm']}: resume it with that class, not {cls.__name__}.")
         with np.load(io.BytesIO(files[_ARRAYS]), allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
-        arguments = _decoded_arguments(state["arguments"], given, arrays)
-        model = cls(env=env, device=device, **arguments)
+        check_names(cls, given, "resume()")
+        settings = {name: given.pop(name) for name in SETTINGS if name in given}
+        later = {name: given.pop(name) for name in cls.restored_arguments if name in given}
+        before = _decoded_arguments(state["arguments"], given, arrays)
+        model = cls(env=env, device=device, **before | given)
         model._check_same_spaces(state)
+        model._check_fixed_arguments(given, before)
         tensors = th.load(io.BytesIO(files[_TENSORS]), map_location=model.device, weights_only=True)
-        model._restore(
-            root, tensors, {name: decode(state[name], arrays) for name in ("progress", "generators", "env", "buffer")}
-        )
+        with networks_named(path, list(given)):
+            model._restore(
+                root, tensors, {name: decode(state[name], arrays) for name in ("progress", "generators", "env", "buffer")}
+            )
+        if model.seed is not None and model.seed != before.get("seed"):
+            model.set_random_seed(model.seed)
+        vars(model).update(settings)
+        model._change_arguments(later)
         model.resumed_notes = state["notes"]
         return model
+
+    def _check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
+        """Of those that were given: that they are what the checkpoint's networks and buffer were made with."""
+        for name in FIXED:
+            if name in given and name in before:
+                check_unchanged(name, getattr(self, KEPT_AS.get(name, name)), before[name], "resume()")
+        if "replay_buffer_kwargs" in given and "replay_buffer_kwargs" in before:
+            now, then = ((arguments["replay_buffer_kwargs"] or {}).get("storage_dtype") for arguments in (given, before))
+            check_unchanged("replay_buffer_kwargs' storage_dtype", now, then, "resume()")
 
     def _check_same_spaces(self, state: dict[str, Any]) -> None:
         now = _describe_spaces(self.observation_space, self.action_space)
@@ -231,6 +254,7 @@ class ResumableAlgorithm(NetworkTraining):
 
     def _restore(self, root: Path, tensors: dict[str, Any], state: dict[str, Any]) -> None:
         self.set_parameters(tensors["parameters"], exact_match=True, device=self.device)
+        self.policy.freeze_as_saved()
         for name, value in tensors["free"].items():
             recursive_setattr(self, f"{name}.data", value.data)
         for name, value in state["progress"].items():
@@ -317,11 +341,12 @@ def _in_memory(write: Any) -> bytes:
 
 
 def _decoded_arguments(stored: dict[str, Any], given: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Those that the checkpoint holds; the others must have been given."""
     missing = {name: entry["cannot"] for name, entry in stored.items() if "cannot" in entry and name not in given}
     if missing:
         reasons = "; ".join(f"{name} ({reason})" for name, reason in missing.items())
         raise ValueError(f"No checkpoint can hold these arguments, pass them to resume() as before: {reasons}.")
-    return {name: decode(entry["value"], arrays) for name, entry in stored.items() if name not in given} | given
+    return {name: decode(entry["value"], arrays) for name, entry in stored.items() if "cannot" not in entry}
 
 
 def _describe_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> dict[str, str]:

@@ -9,6 +9,7 @@ from sb3_gac.common.checks import check_integer, check_positive
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 
 CRITICS = "critic"
+DEFAULT_NET_ARCH = (256, 256)
 T = TypeVar("T")
 
 RoleKeys = Mapping[str, Sequence[str]]
@@ -102,18 +103,16 @@ def role_space(observation_space: spaces.Dict, keys: Sequence[str]) -> spaces.Di
     return spaces.Dict({key: observation_space.spaces[key] for key in keys})
 
 
-def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]] | None) -> dict[str, list[int]]:
+def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]) -> dict[str, list[int]]:
     """
     Hidden layer sizes per role.
 
     :param roles: of the algorithm
     :param net_arch: one list for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each policy and one
-        for "critic"; ``None`` for [256, 256]
+        for "critic"
     :return: role -> sizes, for all roles
     :raises ValueError: if the names are of neither form, or a size is no integer above 0
     """
-    if net_arch is None:
-        net_arch = [256, 256]
     policies = roles.policies
     if isinstance(net_arch, list):
         net_arch = {**dict.fromkeys(policies, net_arch), "critic": net_arch}

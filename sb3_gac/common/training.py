@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_gac.common.actors import RolePolicy
 from sb3_gac.common.compilation import Program, Staged, StagedProgram, compilable_in_stages
 from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.divergence import check_finite_metrics
@@ -45,16 +46,16 @@ class Batch(NamedTuple):
     sequence: PyTorchObs | None = None
     mask: th.Tensor | None = None
 
-    def outputs(self, policy: Callable[[Any], Any]) -> tuple[Any, Any]:
+    def outputs(self, policy: RolePolicy) -> tuple[Any, Any]:
         """
-        :param policy: observations -> distribution
-        :return: on the observations, and, as a constant, on the next ones; of sequences in one pass over time
+        :param policy: a policy's network
+        :return: its distribution for the observations, and, as a constant, for the next ones; for sequences in one pass
         """
         if self.sequence is None:
-            now = policy(self.observations)
+            now = policy.distribution(self.observations)
             with th.no_grad():
-                return now, policy(self.next_observations)
-        both = policy(self.sequence)
+                return now, policy.distribution(self.next_observations)
+        both: Any = policy.distribution(self.sequence)
         return type(both)(*(part[:-1] for part in both)), type(both)(*(part[1:].detach() for part in both))
 
     @th.no_grad()
@@ -154,7 +155,8 @@ class NetworkTraining(FaultTolerance):
         self.policy.set_training_mode(True)
         self.policy.refresh_parameters()
         self._update_learning_rate(self._scheduled_optimizers())
-        self.program_key = (batch_size, self.policy, *(getattr(self, name) for name in self.compiled_settings))
+        settings = (getattr(self, name) for name in self.compiled_settings)
+        self.program_key = (batch_size, self.policy, self.policy.frozen, *settings)
         self._halves_together = self._halves_are_independent and th.get_num_threads() > 1
         with halved_threads(self._halves_together):
             history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
@@ -234,8 +236,10 @@ class NetworkTraining(FaultTolerance):
         :param descent: of that network
         :return: its metrics
         """
-        self.policy.flat_parameters[name].flat.grad = descent.gradient
-        getattr(self.policy, name).optimizer.step()
+        flat_parameters = self.policy.flat_parameters[name]
+        if flat_parameters.parameters:  # unless all are frozen
+            flat_parameters.flat.grad = descent.gradient
+            getattr(self.policy, name).optimizer.step()
         return descent.metrics
 
     @abstractmethod

@@ -64,7 +64,7 @@ class Guider(RolePolicy):
     def relative_to(self, learner: Any, output: Any) -> Distribution:
         """
         :param learner: its distribution for the same observations; treated as a constant, shapes (B, A)
-        :param output: of :meth:`forward`, shapes (B, A)
+        :param output: of :meth:`distribution`, shapes (B, A)
         :return: the guider's action distribution, shapes (B, A)
         """
         if self.max_kl is None:

@@ -10,8 +10,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule
 
+from sb3_gac.common.arguments import PlainSchedule
 from sb3_gac.common.checks import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.common.distributions import KL_REDUCTIONS
 from sb3_gac.common.dual import make_coefficient
@@ -51,6 +51,8 @@ class GAC(GuidedUpdate):
         "MultiInputGruPolicy": GACGruPolicy,
         "MultiInputLstmPolicy": GACLstmPolicy,
     }
+
+    restored_arguments = (*GuidedUpdate.restored_arguments, "kl_coef", "kl_coef_bounds", "kl_coef_learning_rate")
 
     def __init__(
         self,
@@ -176,7 +178,7 @@ class GAC(GuidedUpdate):
 
     def _setup_coefficients(self) -> None:
         super()._setup_coefficients()
-        self.target_kl_schedule = FloatSchedule(self.target_kl)
+        self.target_kl_schedule = PlainSchedule(self.target_kl)
         self.kl_coef_dual = make_coefficient(
             "kl_coef", self.kl_coef, KL_COEF_START, self.kl_coef_bounds, self.kl_coef_learning_rate, self.device
         )

@@ -128,7 +128,7 @@ class GACPolicy(AsymmetricPolicy):
         :param obs: full observation, B of each entry
         :return: shapes (B, A)
         """
-        return self.combine(self.guider(obs), self.learner(obs))
+        return self.combine(self.guider.distribution(obs), self.learner.distribution(obs))
 
     def combine(self, guider_output: Distribution, learner_output: Distribution) -> ActionDistributions:
         """

@@ -63,7 +63,7 @@ def test_a_gradient_step_on_one_view_is_that_of_sb3s_sac(ent_coef):
         expected = th.cat(getattr(theirs.policy, network)(obs, actions), dim=1).t()
         th.testing.assert_close(getattr(ours.policy, network)(obs, actions), expected, rtol=1e-4, atol=1e-5)
     mean, log_std, _ = theirs.policy.actor.get_action_dist_params(obs)
-    actor = ours.policy.actor(obs)
+    actor = ours.policy.actor.distribution(obs)
     th.testing.assert_close(actor.mean, mean, rtol=1e-4, atol=1e-5)
     th.testing.assert_close(actor.log_std, log_std, rtol=1e-4, atol=1e-5)
 
@@ -79,7 +79,7 @@ def test_a_gradient_step_on_one_view_is_that_of_sb3s_sac(ent_coef):
 def test_roles_read_their_entries_and_nothing_else(role_keys, actor, critic):
     policy = _small(role_keys=role_keys).policy
     obs = {"partial": th.randn(8, 2, requires_grad=True), "privileged": th.randn(8, 1, requires_grad=True)}
-    for output, keys in ((policy.actor(obs).mean, actor), (policy.critic(obs, th.zeros(8, 1)), critic)):
+    for output, keys in ((policy.actor.distribution(obs).mean, actor), (policy.critic(obs, th.zeros(8, 1)), critic)):
         gradients = th.autograd.grad(output.sum(), list(obs.values()), allow_unused=True)
         assert [key for key, gradient in zip(obs, gradients, strict=True) if gradient is not None] == keys
 

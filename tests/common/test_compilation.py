@@ -91,7 +91,7 @@ def test_mixed_precision_is_near_full_precision_and_keeps_parameters_and_heads_i
     with th.autocast("cpu", th.bfloat16):
         batch = mixed._sample_batch(4)
         observations = batch.observations if batch.sequence is None else batch.sequence
-        assert {output.dtype for output in mixed.policy.deployed(observations)} == {th.float32}
+        assert {output.dtype for output in mixed.policy.deployed.distribution(observations)} == {th.float32}
 
 
 @pytest.mark.parametrize("env", [TwoViewBandit, TwoViewChoice])

@@ -145,7 +145,7 @@ def test_learner_has_no_gradient_with_respect_to_privileged():
     obs = _observations()
     obs["privileged"].requires_grad_(True)
     obs["partial"].requires_grad_(True)
-    mean, log_std = model.policy.learner(obs)
+    mean, log_std = model.policy.learner.distribution(obs)
     (mean.sum() + log_std.sum()).backward()
     assert obs["privileged"].grad is None
     assert obs["partial"].grad.abs().sum() > 0
@@ -175,10 +175,10 @@ def test_a_log_std_head_that_is_fitted_has_no_say_in_the_clipping_of_the_learner
     flat = model.policy.flat_parameters["learner"]
     assert [id(p) for p in flat.parameters[-2:]] == [id(p) for p in head]
     obs = _observations()
-    mean, log_std = model.policy.learner(obs)
+    mean, log_std = model.policy.learner.distribution(obs)
     alone, _ = flat.gradient(0.01 * mean.sum(), max_norm=None)
     assert 0 < alone.norm() < 1, "not clipped by itself"
-    mean, log_std = model.policy.learner(obs)
+    mean, log_std = model.policy.learner.distribution(obs)
     gradient, norm = flat.gradient(0.01 * mean.sum() + 1e6 * log_std.sum(), max_norm=1.0)
     n_head = sum(p.numel() for p in head)
     assert norm.item() == pytest.approx(alone.norm().item(), rel=1e-6)

@@ -144,7 +144,7 @@ def critic_loss_of(model, critic, batch):
 def test_the_deployed_policy_never_sees_what_is_privileged(cls):
     model = _model(cls).learn(80)
     sequence = {key: value.requires_grad_() for key, value in _observations(4, 2).items()}
-    output = model.policy.deployed(sequence)[0].sum()
+    output = model.policy.deployed.distribution(sequence)[0].sum()
     gradients = th.autograd.grad(output, list(sequence.values()), allow_unused=True)
     assert gradients[0].abs().sum() > 0
     assert gradients[1] is None
