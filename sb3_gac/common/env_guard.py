@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_gac.common.checks import entries_of, fault_of, index_bounds, is_finite
@@ -16,6 +17,8 @@ KEPT = "Nothing of this step was stored, and all that was learned before is kept
 GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
 GUARD = "_environment_guard"
 RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under "terminal_observation"
+REWARD_IS_TAKEN = (DummyVecEnv.step_wait.__code__, Monitor.step.__code__)  # by SB3, which makes a number of it
+NO_NUMBER = ("0-dimensional arrays", "size-1 arrays", "array element with a sequence", "float() argument")  # so numpy says it
 PATIENCE = 2.0  # seconds that a process whose pipe has closed has to end
 
 
@@ -150,10 +153,14 @@ class EnvironmentGuard:
         if isinstance(self.base, SubprocVecEnv) and isinstance(error, (EOFError, OSError)):
             self._failure = _end_processes(self.base)
             return EnvironmentFailedError(self._failure)
-        for frame, _ in traceback.walk_tb(error.__traceback__):  # SB3's own loops know which environment they are at
+        frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+        said = f"{type(error).__name__}: {error}"
+        if frames[-1].f_code in REWARD_IS_TAKEN and any(words in str(error) for words in NO_NUMBER):
+            said += ". Its reward must be a single number, such as float(reward[0])."
+        for frame in frames:  # SB3's own loops know which environment they are at
             if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
                 return EnvironmentFailedError(
-                    f"Environment {frame.f_locals['env_idx']} raised {type(error).__name__}: {error} {KEPT}: mend the "
+                    f"Environment {frame.f_locals['env_idx']} raised {said} {KEPT}: mend the "
                     f"environment; {GO_ON}, or set_env(...) first gives the model another one."
                 )
             if frame.f_code.co_name == "_stack_obs":

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_obs_shape
+
+from sb3_gac.common.entries import stored_shape
 
 Rows = dict[str, np.ndarray]
 
@@ -19,7 +20,7 @@ class ObservationLayout:
     """
 
     def __init__(self, space: spaces.Dict, float_dtype: np.dtype | None = None):
-        self.shapes: dict[str, tuple[int, ...]] = get_obs_shape(space)  # type: ignore[assignment]
+        self.shapes = {key: stored_shape(entry) for key, entry in space.spaces.items()}
         self.dtypes = {key: np.dtype(entry.dtype) for key, entry in space.spaces.items()}
         self.columns: dict[str, tuple[str, slice]] = {}
         self.widths: dict[str, int] = {}

@@ -15,10 +15,12 @@ from typing_extensions import Self
 from sb3_gac.common.arguments import check_shared_arguments, check_what_construction_needs
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
+from sb3_gac.common.entries import check_held_by
 from sb3_gac.common.env_guard import RAW_FINAL
 from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_sequences
 from sb3_gac.common.guard import DeploymentGuard
 from sb3_gac.common.heads import check_action_space, resolve_target_entropy
+from sb3_gac.common.hindsight import check_hindsight
 from sb3_gac.common.parallel import has_side_effects
 from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
 from sb3_gac.common.resuming import ResumableAlgorithm
@@ -190,6 +192,9 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         check_action_space(type(self).__name__, self.action_space)
         check_shared_arguments(self)
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
+        assert isinstance(self.observation_space, spaces.Dict)
+        check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
+        check_hindsight(self.replay_buffer_class, self.replay_buffer_kwargs, self.observation_space, self.env)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
         if self.policy_class.cell is not None:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)

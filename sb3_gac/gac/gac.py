@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from sb3_gac.common.checks import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.common.distributions import KL_REDUCTIONS
 from sb3_gac.common.dual import make_coefficient
+from sb3_gac.common.entries import check_is_observation
 from sb3_gac.common.roles import RoleKeys
 from sb3_gac.gac.actors import GUIDERS
 from sb3_gac.gac.policies import STD_OF, GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
@@ -198,7 +199,15 @@ class GAC(GuidedUpdate):
         :param episode_start: true where an episode starts, shape (B,)
         :param deterministic: mode instead of a sample
         :return: action in the environment's range, and the state for the next call
+        :raises ValueError: naming the entry that is missing, does not fit its space, or is not as many as the others
         """
+        check_is_observation(observation)
+        reads = dict.fromkeys(key for role in ("learner", "guider") for key in self.policy.role_keys[role])
+        missing = [key for key in reads if not isinstance(observation, Mapping) or key not in observation]
+        if missing:
+            raise ValueError(
+                f"The guider reads {list(reads)}, but the observation passed to predict_guider() lacks {missing}."
+            )
         self.policy.set_training_mode(False)
         _, vectorized = self.policy.obs_to_tensor(observation)
         scaled_action, state = self.policy.behaviour_action(observation, state, episode_start, deterministic)
