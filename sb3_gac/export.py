@@ -18,6 +18,7 @@ from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy
 from sb3_gac.common.checks import check_positive, index_bounds
+from sb3_gac.common.entries import computable
 from sb3_gac.common.memory import Memory
 from sb3_gac.common.normalization import DeploymentNormalizer
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
@@ -27,8 +28,6 @@ from sb3_gac.version import __version__
 ACTION, STATE, NEXT_STATE = "action", "state", "next_state"
 METADATA_KEY = "sb3_gac"
 PASSING_NAME = "sb3_gac::value::"  # of inputs and outputs, until they get their own
-#: Types that torch can't export -> types that hold all of their values, or of uint64 as much as a network sees
-FILE_TYPES = {"uint16": "int32", "uint32": "int64", "uint64": "float64"}
 COUNTED = ("smallest", "largest")  # values of what is counted, in the metadata
 ACTION_MEANINGS = {  # whether actions are continuous -> what they are
     True: "the deterministic action, between low and high, for the environment's step()",
@@ -61,8 +60,9 @@ class DeployedModule(nn.Module):
         self.action_name, self.state_name, self.next_state_name = (self._free(name) for name in (ACTION, STATE, NEXT_STATE))
         self.clip_obs = 0.0 if normalizer is None else float(normalizer.clip_obs)
         if isinstance(policy.action_space, spaces.Box):
-            self.register_buffer("low", th.as_tensor(policy.action_space.low))
-            self.register_buffer("high", th.as_tensor(policy.action_space.high))
+            # one-dimensional in any case: what is not, ONNX's exporter computes with in the action's float32
+            self.register_buffer("low", th.as_tensor(np.ravel(policy.action_space.low)))
+            self.register_buffer("high", th.as_tensor(np.ravel(policy.action_space.high)))
 
     def _free(self, name: str) -> str:
         """The name, told apart from an entry that is called the same."""
@@ -98,8 +98,8 @@ class DeployedModule(nn.Module):
     def _in_range(self, action: th.Tensor) -> th.Tensor:
         if not isinstance(self.policy.action_space, spaces.Box):
             return action
-        scaled = self.low.flatten() + 0.5 * (action + 1.0) * (self.high - self.low).flatten()
-        scaled = th.minimum(scaled, self.high.flatten())  # as BoundedPolicy.unscale_action does
+        scaled = self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+        scaled = th.minimum(scaled, self.high)  # as BoundedPolicy.unscale_action does
         return scaled.reshape(-1, *self.policy.action_space.shape)
 
 
@@ -177,7 +177,7 @@ def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> d
             box = {"n": int(space.n)}
         if is_image_space(space):
             box |= {"layout": "channels first" if is_image_space_channels_first(space) else "channels last"}  # type: ignore
-        dtype = str(_file_type(space.dtype))
+        dtype = str(computable(np.empty(0, space.dtype)).dtype)
         return {"name": name, "shape": list(space.shape or ()), "dtype": dtype, "unit": units.get(name), **box}
 
     def of_entry(name: str, space: spaces.Space) -> dict[str, Any]:
@@ -210,14 +210,9 @@ def _finite(bounds: np.ndarray) -> list[float | None]:
     return [bound if np.isfinite(bound) else None for bound in np.ravel(bounds).tolist()]
 
 
-def _file_type(dtype: Any) -> np.dtype:
-    """The type that a file takes an entry of this type as."""
-    return np.dtype(FILE_TYPES.get(np.dtype(dtype).name, dtype))
-
-
 def _example(module: DeployedModule) -> tuple[th.Tensor, ...]:
     """Two observations, of no importance."""
-    entries = [value.astype(_file_type(value.dtype)) for value in draw_observations(module.policy, None, 2).values()]
+    entries = [computable(value) for value in draw_observations(module.policy, None, 2).values()]
     state = [] if module.memory is None else [np.zeros((2, module.memory.state_size), dtype=np.float32)]
     return tuple(th.as_tensor(value) for value in (*entries, *state))
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch as th
-import torch.nn.functional as F
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space, preprocess_obs
@@ -18,6 +17,8 @@ from stable_baselines3.common.vec_env import VecTransposeImage
 
 from sb3_gac.common.checks import held_by, index_bounds, is_finite
 
+#: Types that torch does little with -> types that hold all of their values, or of uint64 as much as a network sees
+COMPUTABLE = {"uint16": "int32", "uint32": "int64", "uint64": "float64"}
 FLOAT32 = np.dtype(np.float32)
 SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 #: Other kinds of spaces -> what to do instead
@@ -121,7 +122,16 @@ def encode(values: th.Tensor, space: spaces.Space, normalize_images: bool) -> th
 
 
 def _one_hot(values: th.Tensor, n: Any, start: Any) -> th.Tensor:
-    return F.one_hot(values.long() - int(start), num_classes=int(n)).float()
+    """Shape (B, n); zeros for what is none of the choices, such as the padding of a sequence."""
+    return (values.long().unsqueeze(-1) == th.arange(int(start), int(start) + int(n), device=values.device)).float()
+
+
+def computable(array: np.ndarray) -> np.ndarray:
+    """
+    :param array: of any type that an entry may have
+    :return: the same, in a type that torch computes with
+    """
+    return array.astype(COMPUTABLE[array.dtype.name]) if array.dtype.name in COMPUTABLE else array
 
 
 # --- what users hand over -----------------------------------------------------------------------------------------------
@@ -222,7 +232,7 @@ class ObservationReader:
         for entry in self.entries:
             if entry.key in observation:
                 rows, counts[entry.key] = entry.read(observation[entry.key])
-                tensors[entry.key] = th.as_tensor(rows, device=device)
+                tensors[entry.key] = th.as_tensor(computable(rows), device=device)
         numbers = set(counts.values())
         if len(numbers) > 1:
             said = ", ".join(f'"{key}" {"one by itself" if n is None else f"a batch of {n}"}' for key, n in counts.items())

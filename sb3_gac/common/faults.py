@@ -5,17 +5,15 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
-from gymnasium import spaces
-from gymnasium.vector import VectorEnv
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
-from sb3_gac.common.checks import check_box_actions, check_same_spaces
-from sb3_gac.common.entries import check_entries
+from sb3_gac.common.checks import check_same_spaces
 from sb3_gac.common.env_guard import FAULTS, guard_environments
+from sb3_gac.common.environments import check_environment
 
 
 class FaultTolerance(OffPolicyAlgorithm):
@@ -30,17 +28,9 @@ class FaultTolerance(OffPolicyAlgorithm):
         """
         Whatever environment the model is given comes through here.
 
-        :raises ValueError: if it is of gymnasium's vector environments, or naming an entry or a component of the actions
-            that the algorithms can't deal with
+        :raises ValueError: see :func:`check_environment`
         """
-        if isinstance(env, VectorEnv):
-            raise ValueError(
-                f"env is one of gymnasium's vector environments ({type(env).__name__}), but SB3's algorithms take SB3's own, "
-                "VecEnv: make it with stable_baselines3.common.env_util.make_vec_env(<id or class>, n_envs=...)."
-            )
-        check_entries(env.observation_space)
-        if isinstance(env.action_space, spaces.Box):
-            check_box_actions(env.action_space)
+        check_environment(env)
         wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         guard_environments(wrapped)
         return wrapped

@@ -17,10 +17,10 @@ from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
 from sb3_gac.common.entries import check_held_by
 from sb3_gac.common.env_guard import RAW_FINAL
+from sb3_gac.common.environments import check_goals, check_rewards_of_goals
 from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_sequences
 from sb3_gac.common.guard import DeploymentGuard
 from sb3_gac.common.heads import check_action_space, resolve_target_entropy
-from sb3_gac.common.hindsight import check_hindsight
 from sb3_gac.common.parallel import has_side_effects
 from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
 from sb3_gac.common.resuming import ResumableAlgorithm
@@ -194,7 +194,7 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
         assert isinstance(self.observation_space, spaces.Dict)
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
-        check_hindsight(self.replay_buffer_class, self.replay_buffer_kwargs, self.observation_space, self.env)
+        check_goals(self.replay_buffer_class, self.observation_space, self.env)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
         if self.policy_class.cell is not None:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
@@ -299,6 +299,12 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
                 values[index] = final[key]  # type: ignore[index]
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, raw_reward, dones, infos)  # type: ignore[arg-type]
         self._last_obs, self._last_original_obs = new_obs, self._vec_normalize_env.get_original_obs()
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        assert self.env is not None
+        check_rewards_of_goals(self.replay_buffer_class, self.replay_buffer_kwargs, self.env)
+        return result
 
     def learn(
         self,
