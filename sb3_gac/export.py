@@ -17,7 +17,8 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from torch import nn
 
 from sb3_gac.common.actors import DeployedPolicy
-from sb3_gac.common.checks import check_positive
+from sb3_gac.common.checks import check_positive, index_bounds
+from sb3_gac.common.entries import computable
 from sb3_gac.common.memory import Memory
 from sb3_gac.common.normalization import DeploymentNormalizer
 from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
@@ -26,6 +27,8 @@ from sb3_gac.version import __version__
 
 ACTION, STATE, NEXT_STATE = "action", "state", "next_state"
 METADATA_KEY = "sb3_gac"
+PASSING_NAME = "sb3_gac::value::"  # of inputs and outputs, until they get their own
+COUNTED = ("smallest", "largest")  # values of what is counted, in the metadata
 ACTION_MEANINGS = {  # whether actions are continuous -> what they are
     True: "the deterministic action, between low and high, for the environment's step()",
     False: "number of the most probable action, from 0 to n - 1, for the environment's step()",
@@ -57,8 +60,9 @@ class DeployedModule(nn.Module):
         self.action_name, self.state_name, self.next_state_name = (self._free(name) for name in (ACTION, STATE, NEXT_STATE))
         self.clip_obs = 0.0 if normalizer is None else float(normalizer.clip_obs)
         if isinstance(policy.action_space, spaces.Box):
-            self.register_buffer("low", th.as_tensor(policy.action_space.low, dtype=th.float32))
-            self.register_buffer("high", th.as_tensor(policy.action_space.high, dtype=th.float32))
+            # one-dimensional in any case: what is not, ONNX's exporter computes with in the action's float32
+            self.register_buffer("low", th.as_tensor(np.ravel(policy.action_space.low)))
+            self.register_buffer("high", th.as_tensor(np.ravel(policy.action_space.high)))
 
     def _free(self, name: str) -> str:
         """The name, told apart from an entry that is called the same."""
@@ -94,7 +98,8 @@ class DeployedModule(nn.Module):
     def _in_range(self, action: th.Tensor) -> th.Tensor:
         if not isinstance(self.policy.action_space, spaces.Box):
             return action
-        scaled = self.low.flatten() + 0.5 * (action + 1.0) * (self.high - self.low).flatten()
+        scaled = self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+        scaled = th.minimum(scaled, self.high)  # as BoundedPolicy.unscale_action does
         return scaled.reshape(-1, *self.policy.action_space.shape)
 
 
@@ -163,12 +168,16 @@ def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> d
     :param algorithm: name of its class
     :param units: entry, or "action" -> unit
     :return: what its file says of itself, as JSON holds it: entries and actions with shapes, types, bounds (``None`` where
-        there is none) and units, and the memory to be carried from one action to the next (``None`` without one)
-    :raises ValueError: if a unit is that of something else
+        there is none) and units, smallest and largest value of what is counted, and the memory to be carried from one action
+        to the next (``None`` without one)
+    :raises ValueError: if a unit is that of something else, or a name has a null character
     """
     unknown = sorted(set(units) - {*module.keys, module.action_name})
     if unknown:
         raise ValueError(f"units names {unknown}, but the policy reads {module.keys} and gives {module.action_name!r}.")
+
+    if any("\0" in key for key in module.keys):
+        raise ValueError(f"The policy reads {module.keys}, but no file can name an entry with a null character: rename it.")
 
     def of(name: str, space: spaces.Space) -> dict[str, Any]:
         box: dict[str, Any] = {}
@@ -178,7 +187,14 @@ def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> d
             box = {"n": int(space.n)}
         if is_image_space(space):
             box |= {"layout": "channels first" if is_image_space_channels_first(space) else "channels last"}  # type: ignore
-        return {"name": name, "shape": list(space.shape or ()), "dtype": str(space.dtype), "unit": units.get(name), **box}
+        dtype = str(computable(np.empty(0, space.dtype)).dtype)
+        return {"name": name, "shape": list(space.shape or ()), "dtype": dtype, "unit": units.get(name), **box}
+
+    def of_entry(name: str, space: spaces.Space) -> dict[str, Any]:
+        bounds = index_bounds(space)  # of what is counted, in the space's shape or for all of it
+        if bounds is None:
+            return of(name, space)
+        return of(name, space) | {what: np.asarray(bound).tolist() for what, bound in zip(COUNTED, bounds, strict=True)}
 
     assert isinstance(module.policy.observation_space, spaces.Dict)
     memory = None
@@ -193,7 +209,7 @@ def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> d
     return {
         "version": __version__,
         "algorithm": algorithm,
-        "entries": [of(key, space) for key, space in module.policy.observation_space.items()],
+        "entries": [of_entry(key, space) for key, space in module.policy.observation_space.items()],
         "action": of(module.action_name, action_space) | {"meaning": ACTION_MEANINGS[isinstance(action_space, spaces.Box)]},
         "memory": memory,
         "normalised": module.normalised,
@@ -206,7 +222,7 @@ def _finite(bounds: np.ndarray) -> list[float | None]:
 
 def _example(module: DeployedModule) -> tuple[th.Tensor, ...]:
     """Two observations, of no importance."""
-    entries = draw_observations(module.policy, None, 2).values()
+    entries = [computable(value) for value in draw_observations(module.policy, None, 2).values()]
     state = [] if module.memory is None else [np.zeros((2, module.memory.state_size), dtype=np.float32)]
     return tuple(th.as_tensor(value) for value in (*entries, *state))
 
@@ -221,12 +237,42 @@ def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
     remembers = module.memory is not None
     inputs = [*module.keys, *[module.state_name] * remembers]
     outputs = [module.action_name, *[module.next_state_name] * remembers]
-    batch = {name: {0: "batch"} for name in (*inputs, *outputs)}
-    names: dict[str, Any] = {"input_names": inputs, "output_names": outputs, "dynamic_axes": batch}
-    th.onnx.export(module, _example(module), str(path), **names, dynamo=False)
+    # torch takes no number as a name, and does not tell an entry from a parameter of the same name
+    names = {f"{PASSING_NAME}{index}": name for index, name in enumerate([*inputs, *outputs])}
+    passing = list(names)
+    th.onnx.export(
+        module,
+        _example(module),
+        str(path),
+        input_names=passing[: len(inputs)],
+        output_names=passing[len(inputs) :],
+        dynamic_axes={name: {0: "batch"} for name in passing},
+        dynamo=False,
+    )
     proto = onnx.load(str(path))
+    _rename(proto.graph, names)
     onnx.helper.set_model_props(proto, {METADATA_KEY: metadata})
     onnx.save(proto, str(path))
+
+
+def _rename(graph: Any, names: dict[str, str]) -> None:
+    """
+    :param graph: of ONNX, changed in place
+    :param names: of values -> new ones; a value that is called like a new one gets another name
+    """
+    values = [*graph.input, *graph.output, *graph.initializer, *graph.value_info]
+    known = {value.name for value in values}.union(*(set(node.output) for node in graph.node))
+    renamed = dict(names)
+    for name in known & set(names.values()):
+        other = f"{name}_"
+        while other in known or other in renamed.values():
+            other += "_"
+        renamed[name] = other
+    for value in values:
+        value.name = renamed.get(value.name, value.name)
+    for node in graph.node:
+        node.input[:] = [renamed.get(name, name) for name in node.input]
+        node.output[:] = [renamed.get(name, name) for name in node.output]
 
 
 def _write_torchscript(module: DeployedModule, path: Path, metadata: str) -> None:

@@ -36,6 +36,7 @@ class Learner:
         self.metadata: dict[str, Any] = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
         entries = self.metadata["entries"]
         self._entries = {entry["name"]: (np.dtype(entry["dtype"]), tuple(entry["shape"])) for entry in entries}
+        self._counted = {entry["name"]: (entry["smallest"], entry["largest"]) for entry in entries if "largest" in entry}
         self._memory: dict[str, Any] | None = self.metadata["memory"]
         self._state: np.ndarray | None = None
 
@@ -63,8 +64,8 @@ class Learner:
         """
         :param observation: of the policy's entries, single or batched, as the sensors give it; where there is one, that alone
         :return: action in the environment's range
-        :raises ValueError: if an entry is missing, not one of the policy's, of another shape or type, or not finite; if the
-            number of observations changes within an episode
+        :raises ValueError: if an entry is missing, not one of the policy's, of another shape or type, not finite, or a choice
+            that there is not; if the number of observations changes within an episode
         """
         inputs, n_rows = self._checked(observation)
         if n_rows is None:
@@ -112,10 +113,18 @@ class Learner:
         if array.dtype != dtype:
             if not np.can_cast(array.dtype, dtype, "same_kind"):
                 raise ValueError(f'The entry "{name}" must be of type {dtype}, but is {array.dtype}: values would be lost.')
-            array = array.astype(dtype)
+            given, array = array, array.astype(dtype)
+            if dtype.kind != "f" and not np.array_equal(given, array):
+                raise ValueError(f'The entry "{name}" holds values that its type {dtype} can\'t hold.')
         n_leading = array.ndim - len(shape)
         if array.shape[n_leading:] != shape or n_leading not in (0, 1):
             raise ValueError(f'The entry "{name}" must have the shape {shape}, or (B, ...) of it, but has {array.shape}.')
         if not np.isfinite(array).all():
             raise ValueError(f'The entry "{name}" holds NaN or infinite values: no action can follow from it.')
+        if name in self._counted:
+            smallest, largest = self._counted[name]
+            if not ((array >= smallest) & (array <= largest)).all():
+                raise ValueError(
+                    f'The entry "{name}" holds values that are not from {smallest} to {largest}: {array.tolist()}.'
+                )
         return array

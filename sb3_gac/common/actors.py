@@ -12,11 +12,25 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_gac.common.distributions import Distribution
+from sb3_gac.common.entries import ObservationReader, check_is_observation
 from sb3_gac.common.heads import LOG_STD_BOUNDS, make_head
 from sb3_gac.common.networks import RoleModel
 
 
-class RolePolicy(RoleModel, BasePolicy):
+class BoundedPolicy(BasePolicy):
+    """A policy whose actions, scaled to the environment's range, stay in it."""
+
+    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
+        """
+        See SB3's ``unscale_action``; here rounding does not lead beyond the upper bound.
+
+        :param scaled_action: in [-1, 1], shape (..., \\*action shape)
+        :return: in the environment's range
+        """
+        return np.minimum(super().unscale_action(scaled_action), self.action_space.high)  # type: ignore[attr-defined]
+
+
+class RolePolicy(RoleModel, BoundedPolicy):
     """
     A policy network on the entries of its role: encoder, hidden layers, and the head that fits the actions.
 
@@ -56,6 +70,7 @@ class RolePolicy(RoleModel, BasePolicy):
             normalize_images=normalize_images,
             squash_output=isinstance(action_space, spaces.Box),
         )
+        self.reader = ObservationReader(observation_space)
         self.rest_extractor = rest_extractor
         self.memory = memory
         self.net_arch = net_arch
@@ -141,13 +156,14 @@ class DeployedPolicy(RolePolicy):
         :param observation: single or batched; a dict with at least the policy's entries, or, where the policy
             reads one entry, that entry alone
         :return: tensors of the policy's entries, and whether they were batched
-        :raises ValueError: if one of the policy's entries is missing
+        :raises ValueError: naming the entry that is missing, does not fit its space, or is not as many as the others
         """
-        return super().obs_to_tensor(self._own_entries(observation))
+        return self.reader.read(self._own_entries(observation), self.device)
 
-    def _own_entries(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def _own_entries(self, observation: np.ndarray | dict[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         assert isinstance(self.observation_space, spaces.Dict)
         keys = list(self.observation_space.spaces)
+        check_is_observation(observation)
         if not isinstance(observation, Mapping):
             if len(keys) > 1:
                 raise ValueError(f"The policy reads {keys}: pass predict() a dict with these entries, not an array.")
@@ -155,7 +171,7 @@ class DeployedPolicy(RolePolicy):
         missing = [key for key in keys if key not in observation]
         if missing:
             raise ValueError(f"The observation passed to predict() lacks {missing}, which the policy reads.")
-        return {key: observation[key] for key in keys}
+        return observation
 
     def predict(
         self,

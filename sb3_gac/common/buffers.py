@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_gac.common.entries import computable
 from sb3_gac.common.observation_store import FinalObservations, ObservationLayout, Rows
 
 DONE, TIME_LIMIT, CUT = 1, 2, 4
@@ -261,6 +262,10 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         if len(positions):
             self._finals.replace_in(following, positions, (steps * self.n_envs + envs)[positions])
         return following
+
+    def to_torch(self, array: np.ndarray, copy: bool = True) -> th.Tensor:
+        """See SB3's ``to_torch``; the tensor is of a type that torch computes with."""
+        return super().to_torch(computable(array), copy)
 
     def _to_tensors(self, rows: Rows, env: VecNormalize | None) -> dict[str, th.Tensor]:
         """One tensor per storage type, of which the entries are views; entry by entry only where they are normalised."""

@@ -1,7 +1,7 @@
 """Checks of what users and environments hand in; each error names the culprit and the remedy."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any
 
@@ -150,6 +150,64 @@ def check_schedule(name: str, value: Any, remedy: str = "or a schedule", may_be_
 # --- spaces and what environments return --------------------------------------------------------------------------------
 
 
+def check_box_actions(space: spaces.Box) -> None:
+    """
+    Actions are made in [-1, 1] and scaled to the space's bounds, and back for the replay buffer.
+
+    :param space: of actions
+    :raises UnsupportedActionSpaceError: naming the components that this can't be done in, and what to do about them
+    """
+    if space.dtype not in (np.float32, np.float64):
+        raise UnsupportedActionSpaceError(
+            f"Box actions must be of type float32 or float64, but the action space is {space}, of type {space.dtype}. Wrap "
+            "the environment in gymnasium.wrappers.TransformAction with a Box of float32, and convert actions there: "
+            f"lambda action: {'np.round(action)' if space.dtype.kind != 'f' else 'action'}.astype(np.{space.dtype})."
+        )
+    if 0 in space.shape:
+        raise UnsupportedActionSpaceError(f"The action space {space} has no component: there is nothing to choose.")
+    said = [
+        f"component {_listed(np.argwhere(components))} {fault(*(bound[components][0] for bound in (space.low, space.high)))}"
+        for components, fault in _box_faults(space)
+        if components.any()
+    ]
+    if said:
+        raise UnsupportedActionSpaceError(
+            f"The action space must have a finite lower and upper bound in every component, low < high, but {'; '.join(said)}"
+        )
+
+
+def _box_faults(space: spaces.Box) -> list[tuple[np.ndarray, Callable[[Any, Any], str]]]:
+    """Where the bounds are at fault, in the space's shape, and what to say of it."""
+    low, high = np.asarray(space.low, dtype=np.float64), np.asarray(space.high, dtype=np.float64)
+    largest = np.finfo(np.float32).max
+    bounded = (np.abs(low) < largest) & (np.abs(high) < largest)
+    with np.errstate(over="ignore", invalid="ignore"):
+        too_wide = bounded & ~np.isfinite((high - low).astype(np.float32))
+    rebound = (
+        "the actuator's range, for example with gymnasium.wrappers.TransformAction(env, lambda action: action, "
+        "gymnasium.spaces.Box(low, high))."
+    )
+    return [
+        (~bounded, lambda low, high: f"is not bounded (low {low:g}, high {high:g}). Give it {rebound}"),
+        (too_wide, lambda low, high: f"is wider than float32 can say (low {low:g}, high {high:g}). Give it {rebound}"),
+        (low > high, lambda low, high: f"has low {low:g} above high {high:g}. Swap them."),
+        (
+            bounded & (low == high),
+            lambda low, high: f"is locked (low == high == {low:g}). Leave it out of the action space, and put its value back "
+            "where the environment is stepped, in a gymnasium.ActionWrapper.",
+        ),
+    ]
+
+
+def _listed(indices: np.ndarray, most: int = 8) -> str:
+    """
+    :param indices: of components, shape (n, dimensions of the space)
+    :param most: named one by one
+    """
+    names = [str(index[0]) if len(index) == 1 else str(tuple(index)) for index in indices[:most].tolist()]
+    return ", ".join(names) + (f" and {len(indices) - most} more" if len(indices) > most else "")
+
+
 def check_same_spaces(kind: str, known: spaces.Space, given: spaces.Space, whose: str) -> None:
     """
     :param kind: "Observation" or "Action"
@@ -197,7 +255,7 @@ def fault_of(value: Any, space: spaces.Space) -> str | None:
         return f"has shape {array.shape}, expected {space.shape}"
     if not np.isfinite(array).all():
         return "holds NaN or infinite values"
-    if not _held_by(space.dtype, array):
+    if not held_by(space.dtype, array):
         return f"has type {array.dtype} and values that the expected {space.dtype} can't hold"
     bounds = index_bounds(space)
     if bounds is not None and not ((array >= bounds[0]) & (array <= bounds[1])).all():
@@ -217,8 +275,12 @@ def is_finite(array: np.ndarray, dtype: Any) -> bool:
     return bool(np.isfinite(array).all())
 
 
-def _held_by(dtype: Any, array: np.ndarray) -> bool:
-    """Whether nothing but precision is lost in this type."""
+def held_by(dtype: Any, array: np.ndarray) -> bool:
+    """
+    :param dtype: a type of numbers
+    :param array: of another one
+    :return: whether nothing but precision is lost in that type
+    """
     if dtype.kind == "f":
         return is_finite(array, dtype)
     with np.errstate(invalid="ignore"):

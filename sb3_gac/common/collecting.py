@@ -16,6 +16,7 @@ from typing_extensions import Self
 
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.env_guard import guard_environments, guard_of
+from sb3_gac.common.environments import check_environment
 from sb3_gac.common.replay_source import ReplaySource
 
 
@@ -38,7 +39,12 @@ class DataCollection(OffPolicyAlgorithm):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """Whatever environment the model is given comes through here."""
+        """
+        Whatever environment the model is given comes through here.
+
+        :raises ValueError: see :func:`check_environment`
+        """
+        check_environment(env)
         wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         guard_environments(wrapped)
         return wrapped

@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_gac.common.checks import described, entries_of, fault_of, index_bounds, is_finite
+from sb3_gac.common.checks import as_sentence, entries_of, fault_of, index_bounds, is_finite
 from sb3_gac.common.env_processes import KEPT, WatchedPipe, end_processes
 from sb3_gac.common.env_use import FINAL, EnvironmentUse, KeepingFinal, SuspiciousEnds
 
@@ -17,6 +18,8 @@ GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
 GUARD = "_environment_guard"
 TRUNCATED = "TimeLimit.truncated"  # SB3's name of an end by time limit in an info
 RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under FINAL
+REWARD_IS_TAKEN = (DummyVecEnv.step_wait.__code__, Monitor.step.__code__)  # by SB3, which makes a number of it
+NO_NUMBER = ("0-dimensional arrays", "size-1 arrays", "array element with a sequence", "float() argument")  # so numpy says it
 
 
 class InvalidStepError(ValueError):
@@ -206,10 +209,14 @@ class EnvironmentGuard:
         if isinstance(self.base, SubprocVecEnv) and isinstance(error, (EOFError, OSError)):
             self._failure = end_processes(self.base)
             return EnvironmentFailedError(self._failure)
-        for frame, _ in traceback.walk_tb(error.__traceback__):  # SB3's own loops know which environment they are at
+        frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+        said = f"{type(error).__name__}: {error}"
+        if frames[-1].f_code in REWARD_IS_TAKEN and any(words in str(error) for words in NO_NUMBER):
+            said += ". Its reward must be a single number, such as float(reward[0])."
+        for frame in frames:  # SB3's own loops know which environment they are at
             if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
                 return EnvironmentFailedError(
-                    f"Environment {frame.f_locals['env_idx']} raised {described(error)} {KEPT}: mend the "
+                    f"Environment {frame.f_locals['env_idx']} raised {as_sentence(said)} {KEPT}: mend the "
                     f"environment; {GO_ON}, or set_env(...) first gives the model another one."
                 )
             if frame.f_code.co_name == "_stack_obs":

@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_gac.common.checks import UnsupportedActionSpaceError, check_range
+from sb3_gac.common.checks import UnsupportedActionSpaceError, check_box_actions, check_range
 from sb3_gac.common.distributions import Categorical, TanhGaussian
 from sb3_gac.common.losses import log_std_loss
 from sb3_gac.common.networks import Head
@@ -129,7 +129,10 @@ def check_action_space(algorithm: str, action_space: spaces.Space) -> None:
     :param action_space: of the environment
     :raises UnsupportedActionSpaceError: if there is no head for it
     """
-    if isinstance(action_space, spaces.Box) or (isinstance(action_space, spaces.Discrete) and action_space.start == 0):
+    if isinstance(action_space, spaces.Box):
+        check_box_actions(action_space)
+        return
+    if isinstance(action_space, spaces.Discrete) and action_space.start == 0:
         return
     remedy = {
         spaces.MultiDiscrete: "Wrap the environment in sb3_gac.envs.FlattenMultiDiscrete, which numbers the combinations.",

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_obs_shape
+
+from sb3_gac.common.entries import stored_shape
 
 Rows = dict[str, np.ndarray]
 
@@ -22,7 +23,7 @@ class ObservationLayout:
     def __init__(self, space: spaces.Dict, float_dtype: np.dtype | None = None):
         if float_dtype is not None and not np.issubdtype(float_dtype, np.floating):
             raise ValueError(f'storage_dtype must be a floating-point type such as "float16", or None, got "{float_dtype}".')
-        self.shapes: dict[str, tuple[int, ...]] = get_obs_shape(space)  # type: ignore[assignment]
+        self.shapes = {key: stored_shape(entry) for key, entry in space.spaces.items()}
         self._given_shapes = {key: entry.shape or () for key, entry in space.spaces.items()}
         self.dtypes = {key: np.dtype(entry.dtype) for key, entry in space.spaces.items()}
         self.columns: dict[str, tuple[str, slice]] = {}

@@ -25,6 +25,8 @@ from sb3_gac.common.arguments import (
 from sb3_gac.common.buffers import CompactDictReplayBuffer
 from sb3_gac.common.checks import plain
 from sb3_gac.common.dual import Coefficient, DualVariable, make_coefficient
+from sb3_gac.common.entries import check_held_by
+from sb3_gac.common.environments import check_goals, check_rewards_of_goals
 from sb3_gac.common.episodes import EpisodeReplayBuffer, check_learns_from_sequences
 from sb3_gac.common.guard import DeploymentGuard
 from sb3_gac.common.heads import check_action_space, resolve_target_entropy
@@ -215,6 +217,9 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         check_action_space(type(self).__name__, self.action_space)
         check_shared_arguments(self)
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
+        assert isinstance(self.observation_space, spaces.Dict)
+        check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
+        check_goals(self.replay_buffer_class, self.observation_space, self.env)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
         if self.policy_class.cell is not None:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
@@ -329,6 +334,12 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         :param action: in [-1, 1], or one of a number
         """
         return self.policy.unscale_action(action) if isinstance(self.action_space, spaces.Box) else action
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        assert self.env is not None
+        check_rewards_of_goals(self.replay_buffer_class, self.replay_buffer_kwargs, self.env)
+        return result
 
     def learn(
         self,

@@ -8,18 +8,18 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
-from sb3_gac.common.actors import DeployedPolicy
+from sb3_gac.common.actors import BoundedPolicy, DeployedPolicy
 from sb3_gac.common.checks import check_integer
 from sb3_gac.common.distributions import Distribution
+from sb3_gac.common.entries import ObservationReader
 from sb3_gac.common.flat import FlatAdam, FlatParameters, TrainedParameters
 from sb3_gac.common.memory import Memory
-from sb3_gac.common.networks import CriticEnsemble, DiscreteCriticEnsemble, VectorExtractor, polyak_average
+from sb3_gac.common.networks import CriticEnsemble, DiscreteCriticEnsemble, EntryExtractor, VectorExtractor, polyak_average
 from sb3_gac.common.roles import (
     DEFAULT_NET_ARCH,
     RoleKeys,
@@ -34,7 +34,7 @@ from sb3_gac.common.roles import (
 BehaviourState: TypeAlias = tuple[np.ndarray, ...] | None
 
 
-class AsymmetricPolicy(BasePolicy):
+class AsymmetricPolicy(BoundedPolicy):
     """
     Networks that read the observation entries of their roles, and their optimisers.
 
@@ -105,6 +105,7 @@ class AsymmetricPolicy(BasePolicy):
             "rnn_hidden_size": rnn_hidden_size,
             "rnn_net_arch": list(rnn_net_arch),
         }
+        self.reader = ObservationReader(observation_space)
         self.n_critics = n_critics
         self.share_features_extractor = share_features_extractor
         self.role_keys = resolve_role_keys(observation_space, self.roles, role_keys)
@@ -147,8 +148,12 @@ class AsymmetricPolicy(BasePolicy):
 
     def _make_extractor(self, keys: Sequence[str]) -> BaseFeaturesExtractor:
         space = role_space(self.observation_space, keys)  # type: ignore[arg-type]
-        if self.features_extractor_class is CombinedExtractor and VectorExtractor.fits(space):
-            return VectorExtractor(space)
+        if self.features_extractor_class is CombinedExtractor:
+            return (
+                VectorExtractor(space)
+                if VectorExtractor.fits(space)
+                else EntryExtractor(space, **self.features_extractor_kwargs)
+            )
         return self.features_extractor_class(space, **self.features_extractor_kwargs)
 
     def _keys_beside_the_deployed(self, role: str) -> list[str]:
@@ -351,11 +356,11 @@ class AsymmetricPolicy(BasePolicy):
         """
         :param observation: dict of observation entries, single or batched; unknown entries are dropped
         :return: tensors, and whether they were batched
+        :raises ValueError: naming the entry that does not fit its space, or is not as many as the others
         """
         if not isinstance(observation, Mapping):
             return self.deployed.obs_to_tensor(observation)
-        known = self.observation_space.spaces  # type: ignore[attr-defined]
-        return super().obs_to_tensor({key: value for key, value in observation.items() if key in known})
+        return self.reader.read(observation, self.device)
 
     def set_training_mode(self, mode: bool) -> None:
         """

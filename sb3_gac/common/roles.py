@@ -6,6 +6,7 @@ from typing import NamedTuple, TypeVar
 from gymnasium import spaces
 
 from sb3_gac.common.checks import check_integer, check_positive
+from sb3_gac.common.entries import check_entries
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 
 CRITICS = "critic"
@@ -49,7 +50,7 @@ class Roles(NamedTuple):
 
 def check_observation_space(observation_space: spaces.Space) -> spaces.Dict:
     """
-    :raises ValueError: unless the space is a flat ``Dict``
+    :raises ValueError: unless the space is a ``Dict`` of entries that can be learned from
     """
     if not isinstance(observation_space, spaces.Dict):
         raise ValueError(
@@ -57,6 +58,7 @@ def check_observation_space(observation_space: spaces.Space) -> spaces.Dict:
             f'"{PRIVILEGED}", for the guider, but the environment has {observation_space}. Wrap the environment in '
             "sb3_gac.envs.SplitObservation, or make one of the registered sb3_gac/* environments."
         )
+    check_entries(observation_space)
     return observation_space
 
 

@@ -15,6 +15,7 @@ from sb3_gac.common.arguments import PlainSchedule
 from sb3_gac.common.checks import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.common.distributions import KL_REDUCTIONS
 from sb3_gac.common.dual import make_coefficient
+from sb3_gac.common.entries import check_is_observation
 from sb3_gac.common.roles import RoleKeys
 from sb3_gac.gac.actors import GUIDERS
 from sb3_gac.gac.policies import STD_OF, GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
@@ -200,8 +201,9 @@ class GAC(GuidedUpdate):
         :param episode_start: true where an episode starts, shape (B,)
         :param deterministic: mode instead of a sample
         :return: action in the environment's range, and the state for the next call
-        :raises ValueError: if an entry that the guider reads is missing
+        :raises ValueError: naming the entry that is missing, does not fit its space, or is not as many as the others
         """
+        check_is_observation(observation)
         self.policy.check_seen_by("guider", observation, "predict_guider()")
         self.policy.set_training_mode(False)
         _, vectorized = self.policy.obs_to_tensor(observation)

@@ -1,5 +1,7 @@
 """Bad input gets an error that names the argument and the remedy, and costs nothing that was there before."""
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, InvalidStepError
+from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, InvalidStepError, Learner, export_learner
 from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
 
 ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
@@ -81,6 +83,104 @@ def test_other_actions(space, remedy):
         ) as e:
             small_model(Other())
         assert remedy in str(e.value) or "must be an instance" in str(e.value)
+
+
+class _Acting(TwoViewBandit):
+    """With an action space of its own."""
+
+    def __init__(self, space):
+        super().__init__(length=5)
+        self.action_space = space
+
+
+def _box(low, high, dtype=np.float32):
+    """Of these bounds, even where gymnasium would refuse them."""
+    space = spaces.Box(-1, 1, np.shape(low), dtype)
+    space.low, space.high = np.array(low, dtype), np.array(high, dtype)
+    return space
+
+
+LARGEST = np.finfo(np.float32).max
+BOUNDS = {
+    "no bounds": (_box([-np.inf] * 2, [np.inf] * 2), r"component 0, 1 is not bounded \(low -inf, high inf\)"),
+    "no upper bound": (_box([0, -1], [np.inf, 1]), r"component 0 is not bounded \(low 0, high inf\)"),
+    "no lower bound": (_box([[-1, -np.inf]], [[1, 1]]), r"component \(0, 1\) is not bounded"),
+    "the largest": (_box([-1, -LARGEST], [1, LARGEST]), "component 1 is not bounded"),
+    "up to the largest": (_box([0, 0], [1, LARGEST]), "component 1 is not bounded"),
+    "the largest of float64": (_box([-1e308], [1e308], np.float64), "component 0 is not bounded"),
+    "NaN": (_box([np.nan, 0], [1, 1]), "component 0 is not bounded .low nan, high 1."),
+    "too wide": (_box([-1, -2e38], [1, 2e38]), r"component 1 is wider than float32 can say \(low -2e\+38"),
+    "locked": (_box([-1, 0.5], [1, 0.5]), r"component 1 is locked \(low == high == 0.5\). Leave it out"),
+    "all locked": (_box(0.0, 0.0), r"component \(\) is locked"),
+    "crossed": (_box([1, -1, 3], [-1, 1, 2]), "component 0, 2 has low 1 above high -1. Swap"),
+    "many": (_box([0] * 20, [0] * 20), "component 0, 1, 2, 3, 4, 5, 6, 7 and 12 more is locked"),
+    "several faults": (_box([0, -np.inf], [0, 1]), "component 1 is not bounded .*; component 0 is locked"),
+    "nothing": (spaces.Box(-1, 1, (0,), np.float32), "has no component"),
+}
+ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("fault", BOUNDS)
+def test_bounds_that_actions_cannot_be_scaled_to_are_named(fault, cls):
+    space, message = BOUNDS[fault]
+    for error in (ValueError, AssertionError):
+        with pytest.raises(error, match=message):
+            small_model(_Acting(space), cls)
+
+
+def test_a_vectorised_environment_or_another_one_is_refused_alike():
+    space, message = BOUNDS["locked"]
+    env = DummyVecEnv([lambda: _Acting(space)] * 2)
+    for give in (small_model, small_model().set_env):
+        with pytest.raises(ValueError, match=message):
+            give(env)
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int32, np.uint8, np.float16, bool])
+def test_box_actions_of_other_types_are_refused_and_the_remedy_helps(dtype):
+    space = spaces.Box(0, 1 if dtype is bool else 10, (2,), dtype)
+    env = _Acting(space)
+    with pytest.raises(ValueError, match=rf"float32 or float64, but the action space is .* of type {space.dtype}") as raised:
+        small_model(env)
+    remedy = re.search(r"(lambda action: .*)\.$", str(raised.value)).group(1)
+    convert = eval(remedy, {"np": np})
+    wrapped = gym.wrappers.TransformAction(env, convert, spaces.Box(0, int(space.high[0]), (2,), np.float32))
+    assert space.contains(convert(wrapped.action_space.sample()))
+    assert small_model(wrapped).learn(14)._n_updates > 0
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(), (2, 1)])
+def test_other_box_actions_are_stored_as_they_were_taken(cls, dtype, shape, tmp_path):
+    """Scaled to [-1, 1], of any shape; a file gives them in the space's own type and precision."""
+    space = spaces.Box(dtype(1e6 if dtype is np.float64 else 3), dtype(1e6 + 0.01 if dtype is np.float64 else 5), shape, dtype)
+    env = _Recorded(space)
+    noise = NormalActionNoise(np.zeros(shape), np.ones(shape)) if shape else None  # SB3's makes an array of no other
+    model = small_model(env, cls, action_noise=noise).learn(30)
+    taken = np.array(env.actions, np.float64)
+    assert all(space.contains(action) for action in env.actions)
+    scaled = 2 * (taken - space.low) / (np.float64(space.high) - space.low) - 1
+    stored = model.replay_buffer.actions[:30].reshape(30, *shape)
+    np.testing.assert_allclose(stored, scaled, atol=1e-6)
+    assert noise is None or (np.abs(stored[10:]) == 1).any()  # where rounding would lead beyond the bounds
+    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
+    given = np.float32([[0.3, -0.2], [2, 3]])
+    actions, expected = learner.act(given), model.predict(given, deterministic=True)[0]
+    assert actions.dtype == expected.dtype == dtype
+    np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-6)
+    assert not np.array_equal(actions[0], actions[1])
+
+
+class _Recorded(_Acting):
+    def __init__(self, space):
+        super().__init__(space)
+        self.actions = []
+
+    def step(self, action):
+        self.actions.append(np.array(action, self.action_space.dtype))
+        return super().step(np.ravel(action))
 
 
 def test_what_discrete_actions_cannot_have():

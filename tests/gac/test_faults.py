@@ -201,6 +201,45 @@ def test_an_environment_is_guarded_once(monkeypatch):
     assert len(calls) == 2 + 3  # two entries at the reset; two and the reward in the step, of all environments at once
 
 
+class _Rewarding(TwoViewBandit):
+    """Returns its reward in some other form, or too little, from a step on."""
+
+    def __init__(self, form, at_step=3):
+        super().__init__(length=100)
+        self.form, self.at_step = form, at_step
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        if self._step == self.at_step and self.form is None:
+            return observation, reward, *rest[1:]
+        return observation, self.form(reward) if self._step == self.at_step else reward, *rest
+
+
+@pytest.mark.parametrize(
+    "form", [lambda r: np.array([r]), lambda r: [r], lambda r: np.array([r, r]), lambda r: np.array([[r]])]
+)
+@pytest.mark.parametrize("vectorize", [lambda env_fns: env_fns[0](), DummyVecEnv, lambda f: VecNormalize(DummyVecEnv(f))])
+def test_a_reward_that_is_no_number_is_named(form, vectorize):
+    model = small_model(vectorize([lambda: _Rewarding(form)]), learning_starts=100)
+    message = r"Environment 0 raised .*Its reward must be a single number, such as float\(reward\[0\]\)"
+    with pytest.raises(EnvironmentFailedError, match=message):
+        model.learn(10)
+    assert model.replay_buffer.pos == 2
+
+
+def test_a_reward_that_is_no_number_is_named_from_subprocesses():
+    env = _subprocesses([lambda: _Rewarding(lambda reward: np.array([reward]), at_step=1)] * 2)
+    with pytest.raises(InvalidStepError, match=r'"reward" of environment 0 has shape \(1,\), expected \(\)'):
+        small_model(env, learning_starts=100).learn(20)
+    env.close()
+
+
+def test_other_errors_of_a_step_are_not_put_down_to_the_reward():
+    with pytest.raises(EnvironmentFailedError, match="not enough values to unpack") as raised:
+        small_model(_Rewarding(None)).learn(10)
+    assert "reward" not in str(raised.value)
+
+
 # --- shapes, types and spaces --------------------------------------------------------------------------------------------
 
 

@@ -1,5 +1,7 @@
 """On whatever entries there are, training works and stores what the environments returned, or an error names the entry."""
 
+import tempfile
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC
+from sb3_gac import GAC, Learner, export_learner
 
 PROPERTIES = settings(
     max_examples=15,
@@ -17,36 +19,50 @@ PROPERTIES = settings(
     database=None,
     phases=(Phase.explicit, Phase.generate),
 )
-DTYPES = {"float32": (-5, 5), "float64": (-5, 5), "uint8": (0, 255), "int32": (-9, 9), "int64": (0, 7)}
+DTYPES = {"float32": (-5, 5), "float64": (-5, 5), "float16": (-5, 5), "bool": (0, 1), "int8": (-9, 9), "int32": (-9, 9)}
+DTYPES |= {"int64": (0, 7), "uint8": (0, 255), "uint16": (0, 999), "uint32": (0, 99), "uint64": (0, 9)}
 
 
 def boxes():
-    """Vectors and matrices of every type."""
-    shapes = st.lists(st.integers(1, 3), min_size=1, max_size=2).map(tuple)
+    """Single numbers, vectors and matrices of every type."""
+    shapes = st.lists(st.integers(1, 3), min_size=0, max_size=2).map(tuple)
     return st.builds(
         lambda dtype, shape: spaces.Box(*DTYPES[dtype], shape, np.dtype(dtype)), st.sampled_from(sorted(DTYPES)), shapes
     )
 
 
 def counted():
-    """What is not measured but counted."""
+    """What is not measured but counted, from any number."""
     return st.one_of(
-        st.integers(2, 4).map(spaces.Discrete),
-        st.lists(st.integers(2, 3), min_size=1, max_size=3).map(spaces.MultiDiscrete),
-        st.integers(1, 3).map(spaces.MultiBinary),
+        st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(2, 4), st.integers(-3, 3)),
+        st.builds(_choices, st.lists(st.integers(2, 3), min_size=1, max_size=2), st.integers(-3, 3), st.integers(0, 2)),
+        st.lists(st.integers(1, 3), min_size=1, max_size=2).map(spaces.MultiBinary),
     )
 
 
-NAMES = st.text(st.characters(codec="utf-8", exclude_characters="."), min_size=1, max_size=8).filter(
-    lambda name: name != "partial"
+def _choices(counts, start, rows):
+    """MultiDiscrete, of one dimension without rows."""
+    nvec = np.array([counts] * rows if rows else counts)
+    return spaces.MultiDiscrete(nvec, start=start + np.arange(nvec.size).reshape(nvec.shape))
+
+
+NAMES = st.one_of(
+    st.sampled_from(["type", "keys", "training", "joint.pos", "1", "low", "state", "action", "camera/front"]),
+    st.text(st.characters(codec="utf-8"), min_size=1, max_size=8).filter(lambda name: name != "partial"),
 )
 OBSERVATIONS = st.builds(
     lambda partial, others: spaces.Dict({"partial": partial, **others}),
     boxes(),
     st.dictionaries(NAMES, st.one_of(boxes(), counted()), min_size=0, max_size=3),
 )
+BOUNDS = st.tuples(st.floats(-1e3, 1e3, width=32), st.floats(-1e3, 1e3, width=32)).filter(lambda b: b[1] - b[0] > 1e-3)
 ACTIONS = st.one_of(
-    st.integers(2, 4).map(spaces.Discrete), st.integers(1, 3).map(lambda n: spaces.Box(-2.0, 3.0, (n,), np.float32))
+    st.integers(2, 4).map(spaces.Discrete),
+    st.builds(
+        lambda bounds, dtype: spaces.Box(*np.array(bounds, dtype).T, dtype=dtype),
+        st.lists(BOUNDS, min_size=1, max_size=3),
+        st.sampled_from([np.float32, np.float64]),
+    ),
 )
 
 
@@ -103,7 +119,10 @@ def _assert_stored(model, envs):
                 np.testing.assert_array_equal(next_observations[key][row, index], np.reshape(after[key], shape))
             stored = buffer.actions[row, index]
             taken = model.policy.unscale_action(stored) if scale else stored[0]
-            np.testing.assert_allclose(taken, action, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(
+                taken, action, rtol=1e-5, atol=1e-6 * (np.ptp([env.action_space.low, env.action_space.high]) if scale else 1)
+            )
+            assert env.action_space.contains(action)
             assert buffer.rewards[row, index] == np.float32(reward)
             assert buffer.dones[row, index] == done
             assert buffer.timeouts[row, index] == (done and env.truncates)
@@ -116,8 +135,66 @@ def test_the_buffer_holds_what_the_environments_returned(space, actions, n_envs,
     model = _model(env).learn(12 * n_envs)
     assert model._n_updates > 0
     _assert_stored(model, envs)
-    action, _ = model.predict({"partial": space["partial"].sample()}, deterministic=True)
+    seen = {"partial": space["partial"].sample()}
+    action, _ = model.predict(seen, deterministic=True)
     assert actions.contains(action if isinstance(actions, spaces.Box) else np.int64(action))
+    with tempfile.TemporaryDirectory() as directory:
+        learner = Learner.load(export_learner(model, f"{directory}/learner.onnx", verify_on=4))
+    exported = learner.act(seen)
+    assert actions.contains(exported)
+    np.testing.assert_allclose(exported, action, rtol=1e-4, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def policies():
+    """That scale actions: the whole, in training, and the deployed one."""
+    policy = _model(_Recording(spaces.Dict(partial=spaces.Box(-1, 1, (1,))), spaces.Box(-1, 1, (1,)), 5)).policy
+    return [policy, policy.deployed]
+
+
+@settings(PROPERTIES, max_examples=300)
+@given(
+    bounds=BOUNDS,
+    dtype=st.sampled_from([np.float32, np.float64]),
+    scaled=st.one_of(st.sampled_from([-1.0, 1.0]), st.floats(-1, 1, width=32)),
+)
+def test_no_action_leaves_its_bounds(bounds, dtype, scaled, policies):
+    space = spaces.Box(*np.array([bounds], dtype).T, dtype=dtype)
+    for policy in policies:
+        policy.action_space = space
+        assert space.contains(policy.unscale_action(np.float32([scaled])).astype(dtype))
+
+
+@settings(PROPERTIES, max_examples=8)
+@given(partial=st.one_of(boxes(), counted()), other=st.one_of(boxes(), counted()), name=NAMES)
+def test_any_entry_of_any_name_is_read_by_a_memory_and_exported(partial, other, name):
+    """Sequences are padded, with what need be none of an entry's values."""
+    space = spaces.Dict({"partial": partial, name: other})
+    small = {"net_arch": [4], "rnn_hidden_size": 4, "rnn_net_arch": [4]}
+    model = GAC(
+        "MultiInputGruPolicy",
+        _Recording(space, spaces.Box(-1, 1, (1,), np.float32), 3),
+        learning_starts=8,
+        batch_size=2,
+        buffer_size=60,
+        policy_kwargs=small,
+        role_keys={"learner": ["partial", name]},
+    ).learn(10)
+    with tempfile.TemporaryDirectory() as directory:
+        model.save(f"{directory}/model")
+        loaded = GAC.load(f"{directory}/model")
+        if "\0" in name:
+            with pytest.raises(ValueError, match="no file can name an entry with a null character"):
+                export_learner(model, f"{directory}/learner.onnx", verify_on=4)
+            return
+        learner = Learner.load(export_learner(model, f"{directory}/learner.onnx", verify_on=4))
+    state = None
+    for _ in range(3):
+        seen = space.sample()
+        expected, after = model.predict(seen, state, deterministic=True)
+        np.testing.assert_allclose(loaded.predict(seen, state, deterministic=True)[0], expected, atol=1e-6)
+        np.testing.assert_allclose(learner.act(seen), expected, atol=1e-5)
+        state = after
 
 
 @PROPERTIES

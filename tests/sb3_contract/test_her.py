@@ -1,7 +1,9 @@
 """SB3's contract: goal environments with HerReplayBuffer, where the learner reads entries of its own choice."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -9,7 +11,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 
-from sb3_gac import GAC
+from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac.envs import SplitDictObservation
+from tests.helpers import TwoViewBandit, small_model
 from tests.sb3_contract.helpers import make_gac, sample_observations
 
 LEARNER = ["observation", "desired_goal"]
@@ -70,3 +74,82 @@ def test_buffer_needs_an_environment(tmp_path):
     _make(make_vec_env(_env)).save(tmp_path / "model")
     with pytest.raises(AssertionError, match="HerReplayBuffer"):
         GAC.load(tmp_path / "model")
+
+
+# --- what it needs of an environment -------------------------------------------------------------------------------------
+
+
+class _Goals(gym.Wrapper):
+    """Goals of two numbers, rewarded by a function of one's own; none for no ``compute_reward``."""
+
+    def __init__(self, reward, desired=(2,)):
+        super().__init__(TwoViewBandit(length=5))
+        self.reward = reward
+        shapes = {"observation": (2,), "achieved_goal": (2,), "desired_goal": desired}
+        self.observation_space = spaces.Dict({key: spaces.Box(-1, 1, shape, np.float32) for key, shape in shapes.items()})
+        if reward is not None:
+            self.compute_reward = reward
+
+    def reset(self, **kwargs):
+        return self.observation_space.sample(), self.env.reset(**kwargs)[1]
+
+    def step(self, action):
+        return self.observation_space.sample(), *self.env.step(action)[1:]
+
+
+def _distances(achieved, desired, infos):
+    return -np.linalg.norm(achieved - desired, axis=-1)
+
+
+def _off(achieved, desired):
+    return np.linalg.norm(achieved - desired)
+
+
+UNFIT = {
+    "a number": (lambda *goals: float(_off(*goals[:2])), r"returns float of shape \(\) for 3 rows of goals"),
+    "numpy's": (lambda *goals: _off(*goals[:2]), r"returns float32 of shape \(\) for 3 rows"),
+    "a list": (lambda *goals: [0.0] * len(goals[0]), r"returns list of shape \(3,\)"),
+    "the other axis": (lambda *goals: goals[0].sum(axis=0), r"returns ndarray of shape \(2,\) for 3 rows"),
+    "a branch": (lambda *goals: -1.0 if (goals[0] == goals[1])[:, 0] else 0.0, "fails on 3 rows of goals .*ambiguous"),
+}
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("unfit", UNFIT)
+def test_compute_reward_must_reward_rows_of_goals(unfit, n_envs):
+    reward, message = UNFIT[unfit]
+    model = _make(make_vec_env(lambda: _Goals(reward), n_envs))
+    with pytest.raises(ValueError, match=rf"{message}.*needs N rewards"):
+        model.learn(20)
+    assert model.num_timesteps == 0
+
+
+def test_compute_reward_must_be_there():
+    with pytest.raises(ValueError, match="The environment has no method compute_reward"):
+        _make(_Goals(None))
+
+
+def test_compute_reward_that_reads_infos_is_taken_at_its_word():
+    def reward(achieved, desired, infos):
+        return _distances(achieved, desired, infos) * [info["TimeLimit.truncated"] for info in infos]
+
+    assert _make(_Goals(reward), {"copy_info_dict": True}, learning_starts=20).learn(40)._n_updates > 0
+    with pytest.raises(ValueError, match=r"fails on 3 rows of goals \(KeyError\('TimeLimit.truncated'\)\)"):
+        _make(_Goals(reward)).learn(20)
+
+
+@pytest.mark.parametrize("rewards", [_distances, lambda *goals: _distances(*goals)[:, None]])
+def test_rewards_of_goals_may_be_a_column(rewards):
+    assert _make(_Goals(rewards), learning_starts=20).learn(40)._n_updates > 0
+
+
+@pytest.mark.parametrize("cls", [GAC, GACShare, GACWithoutQ, AsymmetricSAC])
+def test_an_environment_without_goals_is_named(cls):
+    env = SplitDictObservation(_Goals(_distances), ["observation", "desired_goal"], ["achieved_goal"])
+    with pytest.raises(ValueError, match=r"HerReplayBuffer replaces goals .* has \['partial', 'privileged'\].*role_keys="):
+        small_model(env, cls, replay_buffer_class=HerReplayBuffer)
+
+
+def test_goals_of_two_shapes_are_named():
+    with pytest.raises(ValueError, match=r'"achieved_goal" in the place of "desired_goal", .* give them one shape'):
+        _make(_Goals(_distances, desired=(3,)))
