@@ -15,7 +15,9 @@ import pytest
 import torch as th
 import yaml
 
+import benchmarks.config
 import benchmarks.run
+import benchmarks.suite
 from benchmarks.aggregate import finished_runs, origins
 from benchmarks.checkpoint import locked
 from benchmarks.config import check_runs, environment, instantiate, read_algorithm, resolve
@@ -279,6 +281,67 @@ def test_every_suite_there_is_can_be_launched(suite, tmp_path):
     check_runs(suite.name, read_suite(suite))
 
 
+def test_a_cell_is_all_combinations(tmp_path):
+    path = tmp_path / "suite.yml"
+    cells = [CELL | {"noises": [0.1, 0.05], "algorithms": ["gac", "sac"], "seeds": [3, 1]}]
+    path.write_text(yaml.safe_dump(yaml.safe_load(SMOKE.read_text()) | {"envs": 7, "cells": cells}))
+    order = [(seed, algorithm) for seed in (3, 1) for algorithm in ("gac", "sac")]
+    specs = read_suite(path)
+    assert [(spec.noise, spec.seed, spec.algorithm) for spec in specs] == [
+        (noise, *of) for noise in (0.1, 0.05) for of in order
+    ]
+    assert {(spec.envs, spec.steps, spec.eval_every, spec.eval_episodes) for spec in specs} == {(7, 600, 200, 1)}
+    assert all(spec.overrides == yaml.safe_load(SMOKE.read_text())["overrides"] for spec in specs)
+
+
+def test_directories_tell_runs_apart():
+    spec = RunSpec("gac", "Ant", 0.1, 7, 1000, 4, "small", 500, 1)
+    assert str(spec.directory(Path("runs"))) == "runs/small-1000/Ant-noise0.1/gac/seed7"
+    changes = ({"algorithm": "sac"}, {"task": "Hopper"}, {"noise": 0.05}, {"seed": 8}, {"steps": 2000}, {"preset": "sb3"})
+    assert len({replace(spec, **change).directory(Path()) for change in ({}, *changes)}) == 1 + len(changes)
+
+
+def test_arguments_of_a_class_are_over_those_of_its_ancestors(tmp_path, monkeypatch):
+    (tmp_path / "presets").mkdir()
+    arguments = {
+        "all": {"tau": 0.1, "gamma": 0.1, "batch_size": 1},
+        "GACShare": {"tau": 0.3},
+        "GAC": {"tau": 0.2, "gamma": 0.2},
+    }
+    (tmp_path / "presets" / "layers.yml").write_text(yaml.safe_dump({"run": {}, "arguments": arguments}))
+    (tmp_path / "algorithms.yml").write_text(yaml.safe_dump({"gac-share": {"class": "GACShare"}}))
+    for module in (benchmarks.suite, benchmarks.config):
+        monkeypatch.setattr(module, "HYPERPARAMS", tmp_path)
+    _, arguments = resolve(RunSpec("gac-share", "Ant", 0.1, 7, 1000, 4, "layers", 500, 1))
+    assert (arguments["tau"], arguments["gamma"], arguments["batch_size"]) == (0.3, 0.2, 1)
+
+
+FIGURE = ROOT / "benchmarks/suites/first-figure.yml"
+RESULTS = ROOT / "benchmarks/results/first-figure"
+
+
+def test_launch_leaves_out_what_committed_results_have(tmp_path):
+    specs, recorded = read_suite(FIGURE), json.loads(RESULTS.with_suffix(".json").read_text())["runs"]
+    jobs, finished = jobs_left(FIGURE, tmp_path, [RESULTS])
+    assert [name_of(job.spec) for job in jobs] == [name_of(spec) for spec in specs if name_of(spec) not in recorded]
+    assert finished == len(recorded)
+    jobs, finished = jobs_left(FIGURE, tmp_path, [RESULTS], renewed=["gac"])
+    assert finished == len([name for name in recorded if "/gac/" not in name])
+
+
+@pytest.mark.parametrize("change", [{"eval_episodes": 4}, {"overrides": {"tau": 0.02}}, {"steps": 99_000}, {}])
+def test_committed_results_count_for_the_same_settings_alone(tmp_path, change):
+    path = tmp_path / "suite.yml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(FIGURE.read_text()) | change))
+    _, finished = jobs_left(path, tmp_path, [RESULTS])
+    assert (finished > 0) == (not change)
+
+
+def test_what_is_missing_altogether_is_an_error_in_any_case(tmp_path):
+    with pytest.raises(FileNotFoundError, match="4 runs are not finished"):
+        finished_runs(SMOKE, tmp_path, complete_cells=True)
+
+
 def test_a_run_listed_twice_is_refused(tmp_path):
     suite = yaml.safe_load(SMOKE.read_text())
     suite["cells"].append({**suite["cells"][0], "seeds": [1, 2]})
@@ -307,6 +370,7 @@ def test_arguments_are_layered():
     algorithm_class, arguments = resolve(spec)
     assert algorithm_class is GAC
     assert (arguments["batch_size"], arguments["tau"], arguments["guider"]) == (128, 0.01, "independent")
+    assert arguments["buffer_size"] == 1000, "as many as there are steps"
     assert arguments["policy_kwargs"] == {"net_arch": [128, 128], "activation_fn": "ReLU"}
     assert instantiate(arguments)["policy_kwargs"]["activation_fn"] is th.nn.ReLU
 
