@@ -10,6 +10,7 @@ results that they were aggregated to.  Intervals are stratified bootstraps of 95
 
 import argparse
 import json
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from benchmarks.finished import (
     read_earlier,
     settings_of,
 )
-from benchmarks.suite import HERE, read_cells
+from benchmarks.suite import HERE, RUNS, read_cells
 
 CELL = ["task", "noise"]
 REFERENCE = "sac-asym"
@@ -151,7 +152,9 @@ def guidance(group: pd.DataFrame) -> dict[str, float]:
     if "guider" not in group or group.guider.isna().all():
         return {}
     final = group[group.timesteps == group.timesteps.max()]
-    steady = group[group.timesteps > STEADY_FROM]
+    steady = group[group.timesteps > STEADY_FROM].reindex(
+        columns=["kl", "target_kl"]
+    )  # nobody has them before a gradient step
     ratio = (steady.kl / steady.target_kl).dropna()
     kl = {f"kl_over_target_{name}": round(float(getattr(ratio, name)()), 3) for name in ("min", "mean", "max") if len(ratio)}
     return {"guider_mean": round(float(final.guider.mean()), 1), **kl}
@@ -238,12 +241,34 @@ def _rounded(estimates: dict[str, tuple[float, tuple[float, float]]]) -> dict[st
     return {name: [round(value, 3) for value in (point, low, high)] for name, (point, (low, high)) in estimates.items()}
 
 
-def origins(suite: Path, runs: list[FinishedRun]) -> dict[str, Any]:
-    """Command, commits and versions of the runs, their settings and arguments, and the hours that they took."""
+def command(options: argparse.Namespace) -> str:
+    """
+    :param options: of this program
+    :return: what makes the runs, or those that are not there, and then these results again, in a shell in the checkout
+    """
+    shared = [_from_checkout(options.suite), *_option("--runs", [options.runs] if options.runs != RUNS else [])]
+    shared += [*_option("--earlier", options.earlier), *_option("--renewed", options.renewed)]
+    own = [*_option("--reference", [options.reference] if options.reference else []), *_option("--out", [options.out])]
+    own += ["--complete-cells"] * options.complete_cells
+    made = [["benchmarks.launch", *shared], ["benchmarks.aggregate", *shared, *own]]
+    return " && ".join(shlex.join(["python", "-m", *words]) for words in made)
+
+
+def _option(name: str, values: Sequence[str | Path]) -> list[str]:
+    texts = [_from_checkout(value) if isinstance(value, Path) else value for value in values]
+    return [name, *texts] if texts else []
+
+
+def _from_checkout(path: Path) -> str:
+    path = path.resolve()
+    return str(path.relative_to(HERE.parent) if path.is_relative_to(HERE.parent) else path)
+
+
+def origins(runs: list[FinishedRun]) -> dict[str, Any]:
+    """Commits and versions of the runs, their settings and arguments, and the hours that they took."""
     made_with = _distinct([origin for run in runs for origin in run.origins])
     seconds = [run.seconds for run in runs if run.seconds is not None]
     return {
-        "command": f"python -m benchmarks.launch benchmarks/suites/{suite.name}",
         "made_with": made_with,
         "mixed_runs": [run.name for run in runs if len(run.origins) > 1],
         "cpus": runs[0].cpus,
@@ -267,7 +292,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suite", type=Path)
-    parser.add_argument("--runs", type=Path, default=HERE / "runs")
+    parser.add_argument("--runs", type=Path, default=RUNS)
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
     parser.add_argument("--reference", help=f"to whose final return steps are counted: {REFERENCE}, or the first, by default")
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
@@ -280,7 +305,8 @@ def main() -> None:
     tidy = pd.read_csv(evaluations, dtype={"noise": float})  # so that the scores follow from the file to the last digit
     reference = choose_reference(list(tidy.algorithm.unique()), options.reference)
     results = {
-        **origins(options.suite, runs),
+        "command": command(options),
+        **origins(runs),
         "still_to_run": missing,
         "reference": reference,
         "cells": summarise_cells(tidy, reference),

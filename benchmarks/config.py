@@ -6,17 +6,20 @@ for the classes from which the algorithm descends), the suite's overrides, the a
 """
 
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+import gymnasium as gym
 import torch as th
 import yaml
 from stable_baselines3 import SAC
 
 import sb3_gac
-from benchmarks.suite import HYPERPARAMS, RunSpec, check_keys, read_preset
+from benchmarks.suite import HYPERPARAMS, RunSpec, check_keys, is_number_as_text, read_preset
 
 _OTHERS_CLASSES = {"stable_baselines3.SAC": SAC}
+POLICY = "MultiInputPolicy"
+_GIVEN_TO_POLICIES = {"observation_space", "action_space", "lr_schedule"}
 _LIBRARIES = {"activation_fn": th.nn, "optimizer_class": th.optim}
 
 
@@ -38,21 +41,83 @@ def read_algorithm(name: str) -> tuple[type, dict[str, Any]]:
     return getattr(sb3_gac, class_name), arguments
 
 
+def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
+    """
+    Whether runs can be made, as far as can be told without making one.
+
+    :param where: the suite, for the message
+    :param specs: of its runs
+    :raises ValueError: naming an algorithm, a task or an argument that there is not, or a number that YAML reads as text
+    """
+    for spec in {(spec.algorithm, spec.task, spec.noise): spec for spec in specs}.values():
+        try:
+            environment(spec)
+            resolve(spec)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+
+
+def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
+    """
+    :param spec: of a run
+    :return: id and keyword arguments of its environment; without sensor noise there need be no argument for it
+    :raises ValueError: if there is no such task
+    """
+    ids = {name.removeprefix("sb3_gac/").rpartition("-v")[0]: name for name in gym.registry if name.startswith("sb3_gac/")}
+    if spec.task not in ids:
+        raise ValueError(f"task must be one of the registered sb3_gac/<task>-v<version>, {sorted(ids)}, got {spec.task!r}.")
+    takes_noise = not spec.task.startswith("popgym-")
+    if spec.noise and not takes_noise:
+        raise ValueError(f"{spec.task} has no sensor noise: give noises: [0].")
+    return ids[spec.task], {"noise_std": spec.noise} if takes_noise else {}
+
+
 def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
     """
     :param spec: of a run
     :return: class of the algorithm, and its arguments, as YAML has them
-    :raises ValueError: if an argument is unknown to the class
+    :raises ValueError: if an argument is unknown to the class or its policy, or is a number that YAML reads as text
     """
     algorithm_class, own = read_algorithm(spec.algorithm)
     resolved: dict[str, Any] = {"buffer_size": min(1_000_000, max(spec.steps, 1_000))}
     for layer in (*_preset_layers(spec, algorithm_class), spec.overrides, own):
         resolved = merge(resolved, layer)
-    known = set(inspect.signature(algorithm_class).parameters) - {"env"}
-    unknown = sorted(set(resolved) - known)
-    if unknown:
-        raise ValueError(f"{spec.algorithm}: {algorithm_class.__name__} has no arguments {unknown}.")
+    _check_known(spec.algorithm, resolved, algorithm_class, {"env"})
+    policies, policy = algorithm_class.policy_aliases, resolved.get("policy", POLICY)  # type: ignore[attr-defined]
+    if policy not in policies:
+        raise ValueError(f"{spec.algorithm}: policy must be one of {sorted(policies)}, got {policy!r}.")
+    of_policy = resolved.get("policy_kwargs") or {}
+    _check_known(f"{spec.algorithm}, policy_kwargs", of_policy, policies[policy], _GIVEN_TO_POLICIES)
+    _check_numbers(spec.algorithm, resolved)
     return algorithm_class, resolved
+
+
+def _check_known(where: str, arguments: Mapping[str, Any], taker: type, given: set[str]) -> None:
+    known = sorted(_parameters(taker) - given)
+    unknown = sorted(set(arguments) - set(known))
+    if unknown:
+        raise ValueError(f"{where}: {taker.__name__} has no arguments {unknown}; it has {known}.")
+
+
+def _parameters(taker: type) -> set[str]:
+    """What a class can be made with, and, as long as it hands on what it does not know, those that it descends from."""
+    names: set[str] = set()
+    for ancestor in taker.__mro__:
+        if "__init__" in vars(ancestor):
+            parameters = inspect.signature(vars(ancestor)["__init__"]).parameters.values()
+            names |= {parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD}
+            if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+                break
+    return names - {"self"}
+
+
+def _check_numbers(where: str, value: Any) -> None:
+    """In arguments, and in whatever they hold."""
+    if is_number_as_text(value):
+        raise ValueError(f"{where}: YAML reads {value!r} as text: a number has a decimal point before its e, as in 1.0e-3.")
+    pairs = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in pairs:
+        _check_numbers(f"{where}, {key}", inner)
 
 
 def _preset_layers(spec: RunSpec, algorithm_class: type) -> Iterator[Mapping[str, Any]]:

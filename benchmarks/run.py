@@ -21,7 +21,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
@@ -30,8 +29,8 @@ from stable_baselines3.common.logger import configure
 
 import sb3_gac
 from benchmarks.checkpoint import checkpoints_of, locked, write_atomically
-from benchmarks.config import instantiate, resolve
-from benchmarks.suite import HERE, RunSpec, made_with, read_suite
+from benchmarks.config import POLICY, environment, instantiate, resolve
+from benchmarks.suite import HERE, RUNS, RunSpec, made_with, read_suite
 
 EVAL_SEED = 10_000
 CONFIGURATION = "config.yaml"
@@ -131,7 +130,7 @@ def _train(
         eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=spec.eval_episodes, verbose=0
     )
     checkpoints = checkpoints_of(algorithm_class, directory)
-    arguments = {"policy": "MultiInputPolicy", **instantiate(configuration["arguments"]), "seed": spec.seed}
+    arguments = {"policy": POLICY, **instantiate(configuration["arguments"]), "seed": spec.seed}
     resumed = checkpoints.resume(algorithm_class, arguments, env, spec.seed)
     _write_configuration(directory / CONFIGURATION, configuration, resumed=resumed is not None)
     stopwatch = Stopwatch(directory / "timing.json", evaluation, resumed=resumed is not None)
@@ -146,21 +145,6 @@ def _train(
     model.save(directory / "model")
     stopwatch.write()
     return evaluation.history
-
-
-def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
-    """
-    :param spec: of a run
-    :return: id and keyword arguments of its environment; without sensor noise there need be no argument for it
-    :raises ValueError: if there is no such task
-    """
-    ids = [env_id for env_id in gymnasium.registry if env_id.rpartition("-v")[0] == f"sb3_gac/{spec.task}"]
-    if not ids:
-        raise ValueError(f"task must be one of the registered sb3_gac/<task>-v<version>, got {spec.task!r}.")
-    takes_noise = not spec.task.startswith("popgym-")
-    if spec.noise and not takes_noise:
-        raise ValueError(f"{spec.task} has no sensor noise: give noises: [0].")
-    return ids[0], {"noise_std": spec.noise} if takes_noise else {}
 
 
 def _evaluation_class(algorithm_class: type) -> type[sb3_gac.SeededEvalCallback]:
@@ -187,7 +171,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suite", type=Path, required=True)
     parser.add_argument("--index", type=int, required=True, help="which run of the suite, see launch --dry-run")
-    parser.add_argument("--runs", type=Path, default=HERE / "runs")
+    parser.add_argument("--runs", type=Path, default=RUNS)
     options = parser.parse_args()
     print(run(read_suite(options.suite)[options.index], options.runs, progress_bar=sys.stderr.isatty()))
 

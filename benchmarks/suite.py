@@ -1,7 +1,7 @@
 """A suite: which algorithms, on which tasks, at which noise levels, with which seeds. Read from YAML, checked by name."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 HERE = Path(__file__).parent
+RUNS = HERE / "runs"
 HYPERPARAMS = HERE / "hyperparams"
 _SUITE_KEYS = {"steps", "envs", "preset", "eval_every", "eval_episodes", "overrides", "cells"}
 _CELL_KEYS = {"task", "noises", "algorithms", "seeds"}
@@ -86,9 +87,17 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
     :raises ValueError: if a key is unknown or missing, or a run is listed twice
     """
     suite = yaml.safe_load(path.read_text())
+    check_is(path.name, suite, "a mapping", Mapping)
     if "preset" in suite:
         suite = {**read_preset(suite["preset"])["run"], **suite}
     check_keys(path.name, suite, _SUITE_KEYS, _SUITE_KEYS - {"overrides"})
+    for key in ("steps", "envs", "eval_every", "eval_episodes"):
+        check_is(f"{path.name}, {key}", suite[key], "a whole number above 0", int, lambda number: number > 0)
+    if not suite["envs"] <= suite["eval_every"] <= suite["steps"]:
+        numbers = ", ".join(f"{key} {suite[key]}" for key in ("envs", "eval_every", "steps"))
+        raise ValueError(f"{path.name}: eval_every must be from envs to steps, or no evaluation is made; there are {numbers}.")
+    check_is(f"{path.name}, overrides", suite.get("overrides", {}), "a mapping", Mapping)
+    check_is(f"{path.name}, cells", suite["cells"], "a list of at least one cell", list, len)
     cells = [runs for cell in suite["cells"] for runs in _cells_by_noise(path.name, suite, cell)]
     count = Counter(str(spec.directory(Path())) for cell in cells for spec in cell)
     if twice := sorted(directory for directory, times in count.items() if times > 1):
@@ -97,7 +106,17 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
 
 
 def _cells_by_noise(name: str, suite: dict[str, Any], cell: dict[str, Any]) -> Iterator[list[RunSpec]]:
-    check_keys(f"{name}, a cell", cell, _CELL_KEYS, _CELL_KEYS)
+    where = f"{name}, a cell"
+    check_is(where, cell, "a mapping", Mapping)
+    check_keys(where, cell, _CELL_KEYS, _CELL_KEYS)
+    for key, kinds, what in (
+        ("noises", (int, float), "numbers"),
+        ("seeds", int, "whole numbers"),
+        ("algorithms", str, "names"),
+    ):
+        check_is(f"{where}, {key}", cell[key], f"a list of at least one of {what}", list, len)
+        for value in cell[key]:
+            check_is(f"{where}, {key}", value, f"{what}, each", kinds, lambda value: isinstance(value, str) or value >= 0)
     common = {key: suite[key] for key in ("steps", "envs", "preset", "eval_every", "eval_episodes")}
     common["overrides"] = suite.get("overrides", {})
     for noise in cell["noises"]:
@@ -120,6 +139,35 @@ def read_preset(name: str) -> dict[str, Any]:
     for task, settings in preset.get("tasks", {}).items():
         check_keys(f"{path.name}, {task}", settings, {"arguments", "noises"}, set())
     return preset
+
+
+def check_is(
+    where: str, value: Any, what: str, kinds: type | tuple[type, ...], holds: Callable[[Any], Any] = lambda value: True
+) -> None:
+    """
+    :param where: for the message
+    :param value: read from YAML
+    :param what: it must be, for the message
+    :param kinds: types that it may have
+    :param holds: what else must be so
+    :raises ValueError: if it is something else
+    """
+    if isinstance(value, bool) or not isinstance(value, kinds) or not holds(value):
+        hint = f" YAML reads {value!r} as text: a number has a decimal point before its e." if is_number_as_text(value) else ""
+        raise ValueError(f"{where}: must be {what}, got {value!r}.{hint}")
+
+
+def is_number_as_text(value: Any) -> bool:
+    """
+    :param value: read from YAML, in whose version 1.1 1e-3 is no number and 1.0e-3 is one
+    """
+    if not isinstance(value, str):
+        return False
+    try:
+        float(value)
+    except ValueError:
+        return False
+    return True
 
 
 def check_keys(where: str, mapping: Mapping[str, Any], known: set[str], required: set[str]) -> None:

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 import benchmarks.aggregate
-from benchmarks.aggregate import choose_reference, compare, run_scores, summarise_cells
+from benchmarks.aggregate import choose_reference, compare, interval, run_scores, summarise_cells
 
 
 @pytest.fixture(autouse=True)
@@ -21,22 +21,34 @@ def _evaluations(algorithm, seed, learner, task="T", guider=None):
 
 
 def test_summary_by_hand():
+    """Curves that end below where they began, seeds in disorder, and one far from the others."""
+    ours = {3: [50, 40], 0: [34, 10], 4: [500, 400], 1: [30, 20], 2: [46, 22]}
     tidy = pd.concat(
         [
-            _evaluations("gac", 1, [0, 30], guider=[1, 31]),
-            _evaluations("gac", 0, [4, 10], guider=[5, 11]),
-            _evaluations("sac-asym", 0, [0, 2]),
-            _evaluations("sac-asym", 1, [0, 2]),
+            *(_evaluations("gac", seed, learner, guider=[1, learner[1] + 1]) for seed, learner in ours.items()),
+            *(_evaluations("sac-asym", seed, [97, 98.4]) for seed in (0, 1)),
         ]
-    )
+    ).sort_values("timesteps", ascending=False, kind="stable")
     ours, theirs = summarise_cells(tidy, reference="sac-asym")
-    assert (ours["seeds"], ours["final"], ours["final_mean"]) == ([0, 1], [10, 30], 20)
-    assert ours["final_iqm"] == [20, 10, 30]
-    assert ours["area_iqm"][0] == 11
+    assert (ours["seeds"], ours["final"]) == ([0, 1, 2, 3, 4], [10, 20, 22, 40, 400])
+    assert ours["final_mean"] == 98.4
+    assert ours["final_iqm"][0] == 27.3, "(20 + 22 + 40) / 3; the median is 22"
+    assert ours["area_iqm"][0] == 34.7, "(25 + 34 + 45) / 3, of means over the two evaluations"
     assert (ours["steps_to_reference"], theirs["steps_to_reference"]) == (5_000, 10_000)
-    assert ours["guider_mean"] == 21
-    assert (ours["kl_over_target_min"], ours["kl_over_target_max"]) == (0.8, 1.1)
-    assert theirs["final_iqm"] == [2, 2, 2]
+    assert ours["guider_mean"] == 99.4
+    assert (ours["kl_over_target_min"], ours["kl_over_target_mean"], ours["kl_over_target_max"]) == (0.8, 1.4, 2.0)
+    assert theirs["final_iqm"] == [98.4, 98.4, 98.4]
+    assert "guider_mean" not in theirs
+
+
+def test_the_ends_of_an_interval_leave_out_5_percent():
+    """
+    The mean of three values from 0, 3 and 30 that are drawn with replacement is 0 once in 27 times, and 30 as often: more than
+    2.5%, less than 5%. In five draws, the middle three are all 0 in 0.7% of all cases, and 0, 0 and 3 in as much as 2.5%.
+    """
+    assert interval(np.array([0.0, 3.0, 30.0])) == [11, 0, 30]
+    _, low, _ = interval(np.array([0.0, 3.0, 30.0, 300.0, 3000.0]))
+    assert low > 0
 
 
 def _finals(finals_of, start=0.0):

@@ -15,18 +15,22 @@ import pytest
 import torch as th
 import yaml
 
+import benchmarks.config
 import benchmarks.run
+import benchmarks.suite
 from benchmarks.aggregate import finished_runs, origins
 from benchmarks.checkpoint import locked
-from benchmarks.config import instantiate, read_algorithm, resolve
+from benchmarks.config import check_runs, environment, instantiate, read_algorithm, resolve
 from benchmarks.finished import name_of
 from benchmarks.launch import jobs_left
-from benchmarks.run import Stopwatch, environment, run
+from benchmarks.run import Stopwatch, run
 from benchmarks.suite import RunSpec, made_with, read_preset, read_suite
 from sb3_gac import GAC
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "benchmarks" / "suites" / "smoke.yml"
+SUITES = sorted(SMOKE.parent.glob("*.yml"))
+CELL = {"task": "Hopper", "noises": [0.1], "algorithms": ["gac"], "seeds": [0]}
 
 
 def _program(*arguments):
@@ -51,11 +55,15 @@ def test_each_run_leaves_its_evaluations_configuration_and_model(runs):
         of_guider = {"guider", "kl", "target_kl", "kl_coef"}
         assert of_guider & set(evaluations.columns) == (of_guider if spec.algorithm.startswith("gac") else set())
         configuration = yaml.safe_load((directory / "config.yaml").read_text())
-        assert configuration["run"]["seed"] == spec.seed
+        assert configuration["run"] == asdict(spec)
         assert configuration["versions"]["torch"]
-        read_algorithm(spec.algorithm)[0].load(directory / "model")
+        model = read_algorithm(spec.algorithm)[0].load(directory / "model")
+        assert (model.seed, model.num_timesteps, model.batch_size) == (spec.seed, 600, 16)
         assert not list(directory.glob("checkpoint*"))
         assert list((directory / "tensorboard").glob("events*"))
+    gac, asym, gac_again, _ = (pd.read_csv(spec.directory(runs) / "evaluations.csv").learner for spec in read_suite(SMOKE))
+    assert not gac.equals(asym)
+    assert not gac.equals(gac_again), "the seed does something"
 
 
 def test_a_finished_run_is_skipped_and_an_unfinished_one_done_again(runs):
@@ -79,7 +87,11 @@ def test_results_are_aggregated_and_reported(runs, tmp_path):
     assert record["reference"] == "sac-asym"
     assert len(record["made_with"]) == 1
     assert record["mixed_runs"] == []
-    assert record["command"] == "python -m benchmarks.launch benchmarks/suites/smoke.yml"
+    options = f"--runs {runs}"
+    assert record["command"] == (
+        f"python -m benchmarks.launch benchmarks/suites/smoke.yml {options} && "
+        f"python -m benchmarks.aggregate benchmarks/suites/smoke.yml {options} --out {out}"
+    )
     assert [(cell["algorithm"], cell["seeds"]) for cell in record["cells"]] == [("gac", [0, 1]), ("sac-asym", [0, 1])]
     assert "guider_mean" in record["cells"][0]
     assert "guider_mean" not in record["cells"][1]
@@ -117,11 +129,12 @@ def test_runs_without_their_directories_count_by_the_results_that_they_went_into
     elsewhere = tmp_path / "elsewhere"
     result = _program(*program, elsewhere, "--earlier", tmp_path / "made", "--out", tmp_path / "again")
     assert result.returncode == 0, result.stderr
-    for suffix in (".csv", ".json"):
-        made, again = ((tmp_path / name).with_suffix(suffix).read_text() for name in ("made", "again"))
-        assert again == made
+    assert (tmp_path / "made.csv").read_text() == (tmp_path / "again.csv").read_text()
+    made, again = (json.loads((tmp_path / name).read_text()) for name in ("made.json", "again.json"))
+    assert made.pop("command") != again.pop("command")
+    assert again == made
     names = [name_of(spec) for spec in read_suite(SMOKE)]
-    assert list(json.loads(made)["runs"]) == names
+    assert list(made["runs"]) == names
 
     (elsewhere / names[0]).parent.mkdir(parents=True)
     shutil.copytree(runs / names[0], elsewhere / names[0])
@@ -157,10 +170,10 @@ def test_launch_leaves_out_what_earlier_results_have(runs, tmp_path):
 def test_hours_are_those_of_the_runs_that_were_timed(runs):
     counted, _ = finished_runs(SMOKE, runs)
     some = [run._replace(seconds=seconds) for run, seconds in zip(counted, (None, 1800.0, None, 5400.0), strict=True)]
-    record = origins(SMOKE, some)
+    record = origins(some)
     assert (record["hours"], record["timed_runs"]) == (2.0, 2)
     assert record["seconds_per_run"] == {"median": 3600.0, "max": 5400.0}
-    record = origins(SMOKE, [run._replace(seconds=None) for run in counted])
+    record = origins([run._replace(seconds=None) for run in counted])
     assert (record["hours"], record["timed_runs"], record["seconds_per_run"]) == (0, 0, {})
 
 
@@ -182,20 +195,42 @@ def test_results_that_do_not_name_their_runs_are_refused(tmp_path):
 
 def test_a_failing_run_is_named_with_its_log(tmp_path):
     suite = yaml.safe_load(SMOKE.read_text())
-    suite["cells"] = [{"task": "NoSuchTask", "noises": [0.1], "algorithms": ["gac"], "seeds": [0]}]
+    suite["cells"] = [{"task": "InvertedDoublePendulum", "noises": [0.1], "algorithms": ["gac"], "seeds": [0]}]
+    suite["overrides"]["tau"] = 2
     path = tmp_path / "broken.yml"
     path.write_text(yaml.safe_dump(suite))
     result = _program("benchmarks.launch", path, "--runs", tmp_path, "--retries", 1)
     assert result.returncode == 1
-    log = tmp_path / "small-600" / "NoSuchTask-noise0.1" / "gac" / "seed0" / "log.txt"
+    log = tmp_path / "small-600" / "InvertedDoublePendulum-noise0.1" / "gac" / "seed0" / "log.txt"
     assert f"FAILED, see {log}" in result.stdout.replace("\n", "")
-    assert "NoSuchTask" in log.read_text()
+    assert "tau must be a number from 0 to 1, got 2" in log.read_text()
     assert log.read_text().count("--- attempt") == 2
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"step": 3}, r"unknown keys \['step'\]"), ({"steps": None}, r"missing keys \['steps'\]")],
+    [
+        ({"step": 3}, r"suite.yml: unknown keys \['step'\]"),
+        ({"steps": None}, r"missing keys \['steps'\]"),
+        ({"steps": "1e5"}, r"suite.yml, steps: must be a whole number above 0, got '1e5'. YAML reads '1e5' as text"),
+        ({"envs": 0}, r"suite.yml, envs: must be a whole number above 0, got 0"),
+        ({"eval_episodes": True}, "suite.yml, eval_episodes: must be a whole number above 0, got True"),
+        ({"eval_every": 2.5}, "suite.yml, eval_every: must be"),
+        ({"eval_every": 601}, "eval_every must be from envs to steps.*eval_every 601, steps 600"),
+        ({"eval_every": 1}, "eval_every must be from envs to steps"),
+        ({"overrides": [1]}, r"suite.yml, overrides: must be a mapping, got \[1\]"),
+        ({"cells": []}, "suite.yml, cells: must be a list of at least one cell"),
+        ({"cells": {"task": "Ant"}}, "suite.yml, cells: must be a list"),
+        ({"cells": ["Ant"]}, "suite.yml, a cell: must be a mapping, got 'Ant'"),
+        ({"cells": [CELL | {"seed": 1}]}, r"suite.yml, a cell: unknown keys \['seed'\]"),
+        ({"cells": [CELL | {"seeds": ["0"]}]}, "a cell, seeds: must be whole numbers, each, got '0'"),
+        ({"cells": [CELL | {"seeds": [-1]}]}, "a cell, seeds: must be whole numbers, each, got -1"),
+        ({"cells": [CELL | {"seeds": [0.5]}]}, "a cell, seeds: must be whole numbers, each, got 0.5"),
+        ({"cells": [CELL | {"noises": 0.1}]}, "a cell, noises: must be a list of at least one of numbers, got 0.1"),
+        ({"cells": [CELL | {"noises": ["1e-1"]}]}, "a cell, noises: must be numbers, each, got '1e-1'. YAML reads"),
+        ({"cells": [CELL | {"algorithms": "gac"}]}, "a cell, algorithms: must be a list of at least one of names, got 'gac'"),
+        ({"cells": [CELL | {"algorithms": [1]}]}, "a cell, algorithms: must be names, each, got 1"),
+    ],
 )
 def test_unknown_and_missing_keys_are_refused(tmp_path, change, message):
     suite = {**yaml.safe_load(SMOKE.read_text()), **change}
@@ -204,6 +239,107 @@ def test_unknown_and_missing_keys_are_refused(tmp_path, change, message):
     path.write_text(yaml.safe_dump(suite))
     with pytest.raises(ValueError, match=message):
         read_suite(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cells": [CELL | {"algorithms": ["gac", "sac_asym"]}]}, r"algorithm must be one of \[.*'sac-asym'.*got 'sac_asym'"),
+        ({"cells": [CELL | {"task": "Hoper"}]}, r"task must be one of .*'Hopper'.*got 'Hoper'"),
+        ({"cells": [CELL, CELL | {"task": "popgym-AutoencodeEasy"}]}, "popgym-AutoencodeEasy has no sensor noise"),
+        ({"overrides": {"lerning_rate": 1}}, r"gac: GAC has no arguments \['lerning_rate'\]; it has .*'learning_rate'"),
+        ({"overrides": {"learning_rate": "1e-3"}}, "gac, learning_rate: YAML reads '1e-3' as text.*1.0e-3"),
+        ({"overrides": {"policy": "MlpPolicy"}}, "gac: policy must be one of .*'MultiInputPolicy'.*got 'MlpPolicy'"),
+        (
+            {"overrides": {"policy_kwargs": {"net_archs": [8]}}},
+            r"policy_kwargs: GACPolicy has no arguments .*it has .*'net_arch'",
+        ),
+        (
+            {"overrides": {"policy_kwargs": {"net_arch": {"pi": ["8"]}}}},
+            "policy_kwargs, net_arch, pi, 0: YAML reads '8' as text",
+        ),
+    ],
+)
+def test_what_no_run_could_be_made_with_is_refused_before_the_first_one(tmp_path, change, message):
+    path = tmp_path / "typo.yml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(SMOKE.read_text()) | {"cells": [CELL]} | change))
+    with pytest.raises(ValueError, match=f"^typo.yml: .*{message}"):
+        jobs_left(path, tmp_path)
+
+
+def test_launch_says_what_is_wrong_with_a_suite_in_one_line(tmp_path):
+    path = tmp_path / "typo.yml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(SMOKE.read_text()) | {"cells": [CELL | {"task": "Hoper"}]}))
+    result = _program("benchmarks.launch", path, "--dry-run")
+    assert (result.returncode, result.stdout) == (1, "")
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith("typo.yml: task must be one of")
+
+
+@pytest.mark.parametrize("suite", SUITES, ids=[path.stem for path in SUITES])
+def test_every_suite_there_is_can_be_launched(suite, tmp_path):
+    check_runs(suite.name, read_suite(suite))
+
+
+def test_a_cell_is_all_combinations(tmp_path):
+    path = tmp_path / "suite.yml"
+    cells = [CELL | {"noises": [0.1, 0.05], "algorithms": ["gac", "sac"], "seeds": [3, 1]}]
+    path.write_text(yaml.safe_dump(yaml.safe_load(SMOKE.read_text()) | {"envs": 7, "cells": cells}))
+    order = [(seed, algorithm) for seed in (3, 1) for algorithm in ("gac", "sac")]
+    specs = read_suite(path)
+    assert [(spec.noise, spec.seed, spec.algorithm) for spec in specs] == [
+        (noise, *of) for noise in (0.1, 0.05) for of in order
+    ]
+    assert {(spec.envs, spec.steps, spec.eval_every, spec.eval_episodes) for spec in specs} == {(7, 600, 200, 1)}
+    assert all(spec.overrides == yaml.safe_load(SMOKE.read_text())["overrides"] for spec in specs)
+
+
+def test_directories_tell_runs_apart():
+    spec = RunSpec("gac", "Ant", 0.1, 7, 1000, 4, "small", 500, 1)
+    assert str(spec.directory(Path("runs"))) == "runs/small-1000/Ant-noise0.1/gac/seed7"
+    changes = ({"algorithm": "sac"}, {"task": "Hopper"}, {"noise": 0.05}, {"seed": 8}, {"steps": 2000}, {"preset": "sb3"})
+    assert len({replace(spec, **change).directory(Path()) for change in ({}, *changes)}) == 1 + len(changes)
+
+
+def test_arguments_of_a_class_are_over_those_of_its_ancestors(tmp_path, monkeypatch):
+    (tmp_path / "presets").mkdir()
+    arguments = {
+        "all": {"tau": 0.1, "gamma": 0.1, "batch_size": 1},
+        "GACShare": {"tau": 0.3},
+        "GAC": {"tau": 0.2, "gamma": 0.2},
+    }
+    (tmp_path / "presets" / "layers.yml").write_text(yaml.safe_dump({"run": {}, "arguments": arguments}))
+    (tmp_path / "algorithms.yml").write_text(yaml.safe_dump({"gac-share": {"class": "GACShare"}}))
+    for module in (benchmarks.suite, benchmarks.config):
+        monkeypatch.setattr(module, "HYPERPARAMS", tmp_path)
+    _, arguments = resolve(RunSpec("gac-share", "Ant", 0.1, 7, 1000, 4, "layers", 500, 1))
+    assert (arguments["tau"], arguments["gamma"], arguments["batch_size"]) == (0.3, 0.2, 1)
+
+
+FIGURE = ROOT / "benchmarks/suites/first-figure.yml"
+RESULTS = ROOT / "benchmarks/results/first-figure"
+
+
+def test_launch_leaves_out_what_committed_results_have(tmp_path):
+    specs, recorded = read_suite(FIGURE), json.loads(RESULTS.with_suffix(".json").read_text())["runs"]
+    jobs, finished = jobs_left(FIGURE, tmp_path, [RESULTS])
+    assert [name_of(job.spec) for job in jobs] == [name_of(spec) for spec in specs if name_of(spec) not in recorded]
+    assert finished == len(recorded)
+    jobs, finished = jobs_left(FIGURE, tmp_path, [RESULTS], renewed=["gac"])
+    assert finished == len([name for name in recorded if "/gac/" not in name])
+
+
+@pytest.mark.parametrize("change", [{"eval_episodes": 4}, {"overrides": {"tau": 0.02}}, {"steps": 99_000}, {}])
+def test_committed_results_count_for_the_same_settings_alone(tmp_path, change):
+    path = tmp_path / "suite.yml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(FIGURE.read_text()) | change))
+    _, finished = jobs_left(path, tmp_path, [RESULTS])
+    assert (finished > 0) == (not change)
+
+
+def test_what_is_missing_altogether_is_an_error_in_any_case(tmp_path):
+    with pytest.raises(FileNotFoundError, match="4 runs are not finished"):
+        finished_runs(SMOKE, tmp_path, complete_cells=True)
 
 
 def test_a_run_listed_twice_is_refused(tmp_path):
@@ -234,6 +370,7 @@ def test_arguments_are_layered():
     algorithm_class, arguments = resolve(spec)
     assert algorithm_class is GAC
     assert (arguments["batch_size"], arguments["tau"], arguments["guider"]) == (128, 0.01, "independent")
+    assert arguments["buffer_size"] == 1000, "as many as there are steps"
     assert arguments["policy_kwargs"] == {"net_arch": [128, 128], "activation_fn": "ReLU"}
     assert instantiate(arguments)["policy_kwargs"]["activation_fn"] is th.nn.ReLU
 
