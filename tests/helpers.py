@@ -164,14 +164,14 @@ def unlike_each_other(policy: Any, scale: float = 0.4, seed: int = 0) -> None:
             parameter.add_(scale * th.randn(parameter.shape, generator=generator))
 
 
-def gradient_step(model: Any, batch_size: int, seed: int) -> dict[str, th.Tensor]:
+def gradient_step(model: Any, batch_size: int, seed: int) -> Any:
     """
     One gradient step, targets included.
 
     :param model: that has something in its replay buffer
     :param batch_size: transitions or sequences
     :param seed: of all that is drawn
-    :return: observations that the replay buffer gave
+    :return: samples that the replay buffer gave
     """
     drawn = []
     buffer, sample = model.replay_buffer, model.replay_buffer.sample
@@ -183,7 +183,7 @@ def gradient_step(model: Any, batch_size: int, seed: int) -> dict[str, th.Tensor
     finally:
         del buffer.sample
     (samples,) = drawn
-    return samples.observations
+    return samples
 
 
 def noise_of_step(seed: int, n: int, shape: Any) -> th.Tensor:

@@ -49,6 +49,7 @@ INDEPENDENT = {"guider": "independent"}
 SUM = {"kl_reduction": "sum", "target_kl": 0.4}
 CLIPPED = {"max_grad_norm": 0.5}
 N_STEPS = {"n_steps": 3}
+PARTS = {"replay_buffer_kwargs": {"sequence_length": 2, "burn_in": 2}}
 OTHERS = {
     "kl_coef": 0.7,
     "ent_coef": 0.2,
@@ -101,6 +102,8 @@ CASES = {
     "GRU, guider's std, pulled": Case(GAC, GUIDERS_STD | CLIPPED, {"pull": 1.0}, {"learner_kl_scale": 1.0}, cell="Gru"),
     "GRU, independent": Case(GAC, INDEPENDENT, GUIDERS_STD | {"pull": 1.0}, cell="Gru"),
     "GRU, discrete": Case(GAC, cell="Gru", discrete=True),
+    "GRU, parts of episodes": Case(GAC, GUIDERS_STD, of_model=PARTS, cell="Gru"),
+    "GRU, SAC, parts of episodes": Case(AsymmetricSAC, of_model=PARTS, cell="Gru", normalised=True),
     "GRU, share": Case(GACShare, {}, {"pull": 1.0}, cell="Gru"),
     "GRU, without Q": Case(GACWithoutQ, {}, GUIDERS_STD, cell="Gru"),
     "GRU, SAC": Case(AsymmetricSAC, cell="Gru"),
@@ -147,13 +150,13 @@ def test_a_gradient_step_is_the_plain_one(name):
     settings, arguments = _settings(case)
     model, envs = _model(case, settings, arguments)
     plain = PLAIN[case.cls](model.policy, settings)
-    replay = PlainReplay(envs, model.get_vec_normalize_env(), case.of_model.get("n_steps", 1), settings.gamma)
+    length = case.of_model.get("replay_buffer_kwargs", {}).get("sequence_length")
+    replay = PlainReplay(envs, model.get_vec_normalize_env(), case.of_model.get("n_steps", 1), settings.gamma, length)
     if case.cls in (GACShare, GACWithoutQ):
         assert "learner_critic" not in plain.networks
     before = {key: th.cat([p.detach().flatten().clone() for p in one.parameters()]) for key, one in plain.networks.items()}
     for seed in range(4):
-        observations = gradient_step(model, 5 if case.cell else 16, seed)
-        batch = replay.batch(observations, sequences=bool(case.cell))
+        batch = replay.batch(gradient_step(model, 5 if case.cell else 16, seed))
         metrics = plain.step(batch, noise_of_step(seed, plain.n_noises, batch.actions.shape).double())
         logged = {key: model.logger.name_to_value[f"train/{key}"] for key in metrics}
         assert logged == pytest.approx({key: value.item() for key, value in metrics.items()}, rel=1e-3, abs=1e-5)

@@ -277,7 +277,7 @@ def test_works_with_vec_normalize(n_steps):
     env = VecNormalize(DummyVecEnv([lambda env=env: env for env in envs]), clip_obs=1.3, clip_reward=0.9)
     model = small_model(env, learning_starts=1000, n_steps=n_steps, gamma=0.8).learn(60)
     samples = model.replay_buffer.sample(100, env=env)
-    plain = PlainReplay(envs, env, n_steps, 0.8).batch(samples.observations, sequences=False)
+    plain = PlainReplay(envs, env, n_steps, 0.8).batch(samples)
     for ours, by_hand in ((samples.observations, plain.observations), (samples.next_observations, plain.next_observations)):
         for key, value in by_hand.items():
             np.testing.assert_allclose(ours[key], value, rtol=1e-4, atol=1e-5)

@@ -52,11 +52,12 @@ def test_ensemble_is_so_many_separate_networks(net_arch):
 
 def test_ensemble_members_start_different_and_within_torchs_bounds():
     critics = _critics([64, 64])
-    weights = {5 + 2: critics.input.features_weight, 64: critics.hidden[1].weight}
-    for in_features, weight in weights.items():
-        assert not th.equal(weight[0], weight[1])
-        assert 0.9 * in_features**-0.5 < weight.abs().max() <= in_features**-0.5
-    assert critics.output.weight.abs().max() <= 64**-0.5
+    first = (critics.input.features_weight, critics.input.actions_weight, critics.input.bias)
+    weights = [(5 + 2, first), (64, (critics.hidden[1].weight, critics.output.weight))]
+    for in_features, tensors in weights:
+        for weight in tensors:
+            assert not th.equal(weight[0], weight[1])
+            assert 0.8 * in_features**-0.5 < weight.abs().max() <= in_features**-0.5
 
 
 @pytest.mark.parametrize("dtype", [th.float32, th.float64])

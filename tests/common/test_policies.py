@@ -52,3 +52,15 @@ def test_policies_and_critics_may_differ_in_size(cls):
     assert [critic.net_arch for pair in policy.critic_pairs.values() for critic in pair] == [[4, 5]] * 2 * len(
         policy.critic_pairs
     )
+
+
+@pytest.mark.parametrize(("guider", "starts_at_the_learner"), [("residual", True), ("independent", False)])
+@pytest.mark.parametrize("env", [TwoViewBandit, TwoViewChoice])
+def test_a_residual_guiders_correction_starts_near_zero(env, guider, starts_at_the_learner):
+    """Weights and biases of its last layer; the std's are as they are in any network."""
+    head = small_model(env(), guider=guider).policy.guider.head
+    correction = head.mean if env is TwoViewBandit else head.logits
+    for parameter in correction.parameters():
+        assert (parameter.abs().max() < 0.01 * 16**-0.5) == starts_at_the_learner
+    if env is TwoViewBandit:
+        assert head.log_std.weight.abs().max() > 0.5 * 16**-0.5

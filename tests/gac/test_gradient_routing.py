@@ -8,7 +8,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from sb3_gac import GAC, GACShare, GACWithoutQ
 from sb3_gac.common.distributions import TanhGaussian
 from sb3_gac.common.losses import critic_loss, distillation_loss, guider_loss, learner_loss, log_std_loss
-from tests.helpers import small_model
+from tests.helpers import small_model, unlike_each_other
 
 
 def _observations(n=8):
@@ -46,6 +46,15 @@ def test_guider_loss_moves_the_guider_alone(model):
     kl = guider.kl(learner.detach())
     log_prob = guider.sample_with_log_prob(th.randn_like(guider.mean))[1]
     assert _reached(model.policy, guider_loss(kl, log_prob, th.zeros(2, 8), 1.0, 0.1)) == {"guider"}
+
+
+@pytest.mark.parametrize(("guider", "std_of"), FORMS)
+def test_a_bound_on_kl_moves_neither_the_learner_nor_a_borrowed_std(guider, std_of):
+    model = small_model(guider=guider, std_of=std_of, max_kl=0.01)
+    unlike_each_other(model.policy)
+    distributions = model.policy.distributions(_observations())
+    assert _reached(model.policy, distributions.guider.mean.sum()) == {"guider"}
+    assert model.policy.guider.head.log_std.weight.grad is None, "the mean's place in the ball says nothing of its size"
 
 
 def test_learner_kl_moves_the_learner_alone_and_not_its_log_std_head(model):

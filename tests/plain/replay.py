@@ -89,10 +89,14 @@ class PlainReplay:
     :param vec_normalize: whose statistics normalise observations and rewards, ``None`` for none
     :param n_steps: rewards to sum up
     :param gamma: discount factor
+    :param sequence_length: steps that count in a sequence, ``None`` for whole episodes
     """
 
-    def __init__(self, envs: list[Recorded], vec_normalize: Any, n_steps: int, gamma: float):
+    def __init__(
+        self, envs: list[Recorded], vec_normalize: Any, n_steps: int, gamma: float, sequence_length: int | None = None
+    ):
         self.envs, self.vec_normalize, self.n_steps, self.gamma = envs, vec_normalize, n_steps, gamma
+        self.sequence_length = sequence_length
         self._places = [(env, t) for env in envs for t in range(len(env.steps))]
         self._seen = np.stack([_flat(self.normalised(env.steps[t].obs)) for env, t in self._places])
 
@@ -110,15 +114,15 @@ class PlainReplay:
         bound = self.vec_normalize.clip_reward
         return float(np.clip(reward / np.sqrt(self.vec_normalize.ret_rms.var + 1e-8), -bound, bound))
 
-    def batch(self, observations: dict[str, th.Tensor], sequences: bool) -> Batch:
+    def batch(self, samples: Any) -> Batch:
         """
-        :param observations: that the replay buffer drew; all else is looked up
-        :param sequences: whether these are whole episodes, from their start on
+        :param samples: that the replay buffer gave: of transitions, or with a mask, of sequences. Which ones these are is
+            told by their first observations, and how many steps only bring memories up by the mask; all else is looked up
         """
-        first = {key: (value[0] if sequences else value).numpy() for key, value in observations.items()}
-        rows = [{key: value[row] for key, value in first.items()} for row in range(len(first["partial"]))]
-        places = [self._place(row) for row in rows]
-        return self._of_episodes(places) if sequences else self._of_transitions(places)
+        sequences = hasattr(samples, "mask")
+        first = {key: (value[0] if sequences else value).numpy() for key, value in samples.observations.items()}
+        places = [self._place({key: value[row] for key, value in first.items()}) for row in range(len(first["partial"]))]
+        return self._of_sequences(places, samples.mask.argmax(dim=0).tolist()) if sequences else self._of_transitions(places)
 
     def _place(self, obs: dict[str, np.ndarray]) -> tuple[Recorded, int]:
         distances = np.abs(self._seen - _flat(obs)).max(axis=1)
@@ -148,16 +152,20 @@ class PlainReplay:
             th.ones(len(places), dtype=th.float64),
         )
 
-    def _of_episodes(self, places: list[tuple[Recorded, int]]) -> Batch:
+    def _of_sequences(self, places: list[tuple[Recorded, int]], burn_in: list[int]) -> Batch:
         """Side by side; what pads the short ones, their last step again and again, must not matter."""
         episodes = []
-        for env, t in places:
+        for (env, t), before in zip(places, burn_in, strict=True):
             end = next(end for end in range(t, len(env.steps)) if env.steps[end].ended)
-            episodes.append(env.steps[t : end + 1])
+            rest = env.steps[t : end + 1]
+            episodes.append(rest if self.sequence_length is None else rest[: before + self.sequence_length])
         length = max(len(episode) for episode in episodes)
         padded = [episode + [episode[-1]] * (length - len(episode)) for episode in episodes]
         observations = [_stacked([self.normalised(obs) for obs in _observations(one, length + 1)]) for one in episodes]
-        counts = [[float(t < len(episode)) for t in range(length)] for episode in episodes]
+        counts = [
+            [float(before <= t < len(episode)) for t in range(length)]
+            for episode, before in zip(episodes, burn_in, strict=True)
+        ]
         return Batch(
             {key: th.stack([obs[key] for obs in observations], dim=1) for key in observations[0]},
             None,
