@@ -9,7 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_gac.common.actors import DeployedPolicy
+from sb3_gac.common.actors import Actor
 from sb3_gac.common.compilation import compilable
 from sb3_gac.common.distributions import Distribution
 from sb3_gac.common.heads import LOG_STD_BOUNDS
@@ -47,7 +47,7 @@ class AsymmetricSACPolicy(AsymmetricPolicy):
     ):
         super().__init__(observation_space, action_space, net_arch, activation_fn, **kwargs)
         self.constructor_options["log_std_bounds"] = log_std_bounds
-        self.actor = DeployedPolicy(**self._role_kwargs("actor"), log_std_bounds=log_std_bounds)
+        self.actor = Actor(**self._role_kwargs("actor"), log_std_bounds=log_std_bounds)
         shared = self.actor.features_extractor if self.share_features_extractor else None
         self.critic, self.critic_target = self._make_critic_and_target("critic", shared)
         self._finish(lr_schedule)

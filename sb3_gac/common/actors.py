@@ -81,16 +81,9 @@ class RolePolicy(RoleModel, BoundedPolicy):
         latent_dim = net_arch[-1] if net_arch else features_dim
         self.head = make_head(latent_dim, action_space, log_std_bounds)
 
-    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """
-        Actions, as from the actor of SB3's SAC: samples of a Gaussian are differentiable.
-
-        :param obs: observation with at least the entries of this role, (B, ...) of each; for a policy with a memory, those
-            of an episode's first step
-        :param deterministic: mode instead of a sample
-        :return: actions in [-1, 1], shape (B, A), or numbers of actions, shape (B,)
-        """
-        return self._predict(obs, deterministic)
+    def forward(self, obs: PyTorchObs) -> Distribution:
+        """See :meth:`distribution`."""
+        return self.distribution(obs)
 
     def distribution(self, obs: PyTorchObs) -> Distribution:
         r"""
@@ -203,3 +196,16 @@ class DeployedPolicy(RolePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         actions, _ = self.remember(observation, None, None)
         return actions.mode if deterministic else actions.sample()
+
+
+class Actor(DeployedPolicy):
+    """A deployed policy that returns actions when it is called, as the actor of SB3's SAC does."""
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:  # type: ignore[override]
+        """
+        :param obs: observation with at least the policy's entries, (B, ...) of each; for a policy with a memory, those of
+            an episode's first step
+        :param deterministic: mode instead of a sample, which is differentiable where actions are continuous
+        :return: actions in [-1, 1], shape (B, A), or numbers of actions, shape (B,)
+        """
+        return self._predict(obs, deterministic)

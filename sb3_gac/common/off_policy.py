@@ -270,8 +270,8 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
 
     @property
     def actor(self) -> th.nn.Module:  # type: ignore[override]
-        """The deployed policy."""
-        return self.policy.deployed
+        """The deployed policy; called, it returns actions."""
+        return self.policy.actor  # type: ignore[return-value]
 
     @property
     def critic(self) -> th.nn.Module:

@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_gac.common.actors import DeployedPolicy, RolePolicy
+from sb3_gac.common.actors import Actor, DeployedPolicy, RolePolicy
 from sb3_gac.common.distributions import Distribution, TanhGaussian, project_to_kl_ball
 
 DELTA_INIT_SCALE = 0.01
@@ -46,6 +46,19 @@ class Learner(DeployedPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {"owns_std": self.owns_std}
+
+
+class LearnerAsActor(Actor, Learner):
+    """The learner under SB3's name: called, it returns actions, and all else is the learner's own."""
+
+    @classmethod
+    def of(cls, learner: Learner) -> "LearnerAsActor":
+        """
+        :param learner: whose parameters and attributes it shares
+        """
+        actor = cls.__new__(cls)
+        object.__setattr__(actor, "__dict__", learner.__dict__)
+        return actor
 
 
 class Guider(RolePolicy):

@@ -13,7 +13,7 @@ from sb3_gac.common.heads import LOG_STD_BOUNDS
 from sb3_gac.common.networks import CriticEnsemble
 from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
 from sb3_gac.common.roles import Roles
-from sb3_gac.gac.actors import GUIDERS, Learner
+from sb3_gac.gac.actors import GUIDERS, Learner, LearnerAsActor
 
 STD_OF = ("learner", "guider")
 
@@ -102,9 +102,9 @@ class GACPolicy(AsymmetricPolicy):
         self._finish(lr_schedule, unclipped=len(self.learner.deployment_parameters()))
 
     @property
-    def actor(self) -> Learner:
-        """SB3's name for the policy that acts at evaluation."""
-        return self.learner
+    def actor(self) -> LearnerAsActor:
+        """SB3's name for the policy that acts at evaluation; called, it returns actions."""
+        return LearnerAsActor.of(self.learner)
 
     @property
     def critic(self) -> CriticEnsemble:

@@ -61,7 +61,7 @@ def test_the_actor_returns_the_actions_that_predict_scales(cls, kind):
     assert actions.shape == ((5,) if kind == "Discrete" else (5, 1))
     expected, _ = model.predict(observation, deterministic=True)
     np.testing.assert_allclose(actions.detach().numpy(), expected, rtol=1e-4, atol=1e-6)
-    for alone in (model.policy, model.policy.deployed):
+    for alone in (model.policy, model.policy.actor):
         th.testing.assert_close(alone(obs, deterministic=True), actions)
     assert any(not th.equal(model.actor(obs), actions) for _ in range(20)), "samples, if not told otherwise"
 
@@ -73,10 +73,13 @@ def test_a_gaussian_actors_samples_are_differentiable():
     assert model.actor.head.log_std.weight.grad.abs().sum() > 0
 
 
-def test_the_guider_alone_has_no_actions():
+def test_the_learner_under_its_own_name_returns_its_distribution_and_is_the_actor():
     model = small_model()
-    with pytest.raises(TypeError, match="predict_guider"):
-        model.policy.guider(model.policy.obs_to_tensor(model.get_env().reset())[0])
+    obs, _ = model.policy.obs_to_tensor(model.get_env().reset())
+    assert th.equal(model.policy.learner(obs).mode, model.actor(obs, deterministic=True))
+    assert [id(p) for p in model.actor.parameters()] == [id(p) for p in model.policy.learner.parameters()]
+    model.actor.set_training_mode(True)
+    assert model.policy.learner.training
 
 
 @pytest.mark.parametrize("cls", ALGORITHMS)
