@@ -41,6 +41,13 @@ def test_summary_by_hand():
     assert "guider_mean" not in theirs
 
 
+def test_a_runs_scores_are_its_last_return_and_the_mean_of_all():
+    rows = [{"timesteps": steps, "learner": value} for steps, value in ((300, 3.0), (100, 0.0), (200, 30.0))]
+    tidy = pd.DataFrame(rows).assign(task="T", noise=0.1, algorithm="gac", seed=0)
+    (scores,) = run_scores(tidy).to_dict("records")
+    assert (scores["final"], scores["area"]) == (3, 11)
+
+
 def test_the_ends_of_an_interval_leave_out_5_percent():
     """
     The mean of three values from 0, 3 and 30 that are drawn with replacement is 0 once in 27 times, and 30 as often: more than
