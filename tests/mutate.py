@@ -167,8 +167,12 @@ def _run_pytest(tree: Path, log: Path, arguments: list[str]) -> None:
     sys.path.insert(0, str(tree))
     for name in [name for name in sys.modules if name.partition(".")[0] in ("sb3_gac", "benchmarks", "tests")]:
         del sys.modules[name]
+    import hypothesis
     import pytest
 
+    found_is_enough = (hypothesis.Phase.explicit, hypothesis.Phase.generate)  # to make an example smaller takes longest
+    hypothesis.settings.register_profile("mutants", phases=found_is_enough, database=None, derandomize=True)
+    hypothesis.settings.load_profile("mutants")
     sys.exit(pytest.main(arguments))
 
 

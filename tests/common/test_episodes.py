@@ -114,6 +114,15 @@ def test_episodes_are_drawn_uniformly_and_sequences_by_steps():
         assert of_first == pytest.approx(shares[0], abs=0.03)
 
 
+def test_a_long_episode_whose_start_was_overwritten_is_gone_though_shorter_ones_ended_before_it():
+    """The ring holds ten steps; the first environment's episode has twelve, the second's have three."""
+    recorder = Recorder(_buffer(10, n_envs=2))
+    for step in range(12):
+        recorder.step([TERMINATED if step == 11 else NONE, TERMINATED if step % 3 == 2 else NONE])
+    assert recorder.buffer.n_episodes == 3
+    _check(recorder.buffer.sample(30), [episode for first, episode in recorder.finished if first >= 2], whole=True)
+
+
 def test_memory_is_that_of_single_steps():
     recorder = Recorder(_buffer(size=10_000))
     for step in range(2_000):
