@@ -5,7 +5,6 @@ In order: the preset's arguments, those of the task, those of the task at that n
 for the classes from which the algorithm descends), the suite's overrides, the algorithm's own.
 """
 
-import inspect
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -16,6 +15,7 @@ from stable_baselines3 import SAC
 
 import sb3_gac
 from benchmarks.suite import HYPERPARAMS, RunSpec, check_keys, is_number_as_text, read_preset
+from sb3_gac.common.arguments import constructor_parameters
 
 _OTHERS_CLASSES = {"stable_baselines3.SAC": SAC}
 POLICY = "MultiInputPolicy"
@@ -93,22 +93,10 @@ def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
 
 
 def _check_known(where: str, arguments: Mapping[str, Any], taker: type, given: set[str]) -> None:
-    known = sorted(_parameters(taker) - given)
+    known = sorted(set(constructor_parameters(taker)) - given)
     unknown = sorted(set(arguments) - set(known))
     if unknown:
         raise ValueError(f"{where}: {taker.__name__} has no arguments {unknown}; it has {known}.")
-
-
-def _parameters(taker: type) -> set[str]:
-    """What a class can be made with, and, as long as it hands on what it does not know, those that it descends from."""
-    names: set[str] = set()
-    for ancestor in taker.__mro__:
-        if "__init__" in vars(ancestor):
-            parameters = inspect.signature(vars(ancestor)["__init__"]).parameters.values()
-            names |= {parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD}
-            if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-                break
-    return names - {"self"}
 
 
 def _check_numbers(where: str, value: Any) -> None:

@@ -47,7 +47,24 @@ def constructor_arguments(algorithm: type) -> list[str]:
     :param algorithm: a class
     :return: names of the arguments that are kept with a model, as the attribute of that name or as :data:`KEPT_AS` says
     """
-    return [name for name in inspect.signature(algorithm).parameters if name not in ("env", "device", "_init_setup_model")]
+    return [name for name in constructor_parameters(algorithm) if name not in ("env", "device", "_init_setup_model")]
+
+
+def constructor_parameters(kind: type) -> list[str]:
+    """
+    :param kind: a class
+    :return: names of what it can be made with and, as long as it hands on what it does not know, of what its ancestors can
+    """
+    names: dict[str, None] = {}
+    for ancestor in kind.__mro__:
+        if "__init__" in vars(ancestor):
+            parameters = inspect.signature(vars(ancestor)["__init__"]).parameters.values()
+            kinds = {parameter.kind for parameter in parameters}
+            hands_on = {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
+            names |= {parameter.name: None for parameter in parameters if parameter.kind not in hands_on}
+            if inspect.Parameter.VAR_KEYWORD not in kinds:
+                break
+    return [name for name in names if name != "self"]
 
 
 def make_arguments_plain(model: OffPolicyAlgorithm) -> None:

@@ -1,6 +1,5 @@
 """Training that diverged: found where metrics come to the host anyway, and written down."""
 
-import inspect
 import json
 import math
 from collections.abc import Mapping
@@ -9,6 +8,8 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_gac.common.arguments import constructor_parameters
 
 
 class DivergenceError(RuntimeError):
@@ -96,7 +97,7 @@ def write_diagnosis(diagnosis: dict[str, Any], directory: str | None, step: int)
 
 def _arguments(model: OffPolicyAlgorithm) -> dict[str, Any]:
     """What the constructor was given, as far as the model has kept it."""
-    names = [name for name in inspect.signature(type(model).__init__).parameters if name in vars(model) and name != "env"]
+    names = [name for name in constructor_parameters(type(model)) if name in vars(model) and name != "env"]
     return {name: getattr(model, name) for name in names} | {"policy": model.policy_class.__name__}
 
 

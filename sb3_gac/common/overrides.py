@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from sb3_gac.common.arguments import constructor_arguments
+from sb3_gac.common.arguments import constructor_arguments, constructor_parameters
 from sb3_gac.common.checks import plain
 from sb3_gac.common.policies import AsymmetricPolicy
 
@@ -56,7 +56,7 @@ def check_names(kind: type, given: Iterable[str], where: str) -> None:
         if name in known:
             continue
         policy_class: type = kind.policy_aliases.get("MultiInputPolicy", AsymmetricPolicy)  # type: ignore[attr-defined]
-        if any(name in inspect.signature(base).parameters for base in policy_class.__mro__[:-1]):
+        if name in constructor_parameters(policy_class):
             hint = "It is one of policy_kwargs, which stay those that the model was made with."
         elif name == "n_envs":
             hint = "It follows from env."

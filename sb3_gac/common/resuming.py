@@ -162,10 +162,10 @@ class ResumableAlgorithm(NetworkTraining):
         """Of the constructor, as far as they can be written down; of the others, what can't be."""
         arguments: dict[str, Any] = {}
         for name in constructor_arguments(type(self)):
-            value = getattr(self, KEPT_AS.get(name, name))
-            if isinstance(value, TrainFreq):
-                value = (value.frequency, value.unit.value)
             try:
+                value = getattr(self, KEPT_AS.get(name, name))
+                if isinstance(value, TrainFreq):
+                    value = (value.frequency, value.unit.value)
                 arguments[name] = {"value": encode(value, arrays)}
             except (UntrustedNameError, AttributeError, TypeError) as error:
                 arguments[name] = {"cannot": str(error)}

@@ -258,3 +258,24 @@ def test_other_buffers_are_left_alone(tmp_path):
     loaded = GAC.load(tmp_path / "model", env=TwoViewBandit())
     loaded.load_replay_buffer(tmp_path / "buffer")
     assert loaded.learn(15)._n_updates > 0
+
+
+class _HandsOn(GAC):
+    """As users write them: it names no argument but its own."""
+
+    def __init__(self, *args, weight=1.0, **kwargs):
+        self.weight = weight
+        super().__init__(*args, **kwargs)
+
+
+def test_a_subclass_that_hands_its_arguments_on(tmp_path):
+    """Those of its ancestors are its own: to override, to write down, to resume with."""
+    model = small_model(cls=_HandsOn, gamma=0.8, weight=2.0).learn(12)
+    model.save(tmp_path / "model")
+    loaded = _HandsOn.load(tmp_path / "model", env=TwoViewBandit(), target_kl=0.02)
+    assert (loaded.gamma, loaded.weight, loaded.current_target_kl) == (0.8, 2.0, 0.02)
+    model.save_checkpoint(tmp_path / "checkpoints")
+    resumed = _HandsOn.resume(tmp_path / "checkpoints", TwoViewBandit(), device="cpu", tau=0.1)
+    assert (resumed.gamma, resumed.weight, resumed.tau) == (0.8, 2.0, 0.1)
+    with pytest.raises(TypeError, match=r'"gama", which is no argument of _HandsOn. Is "gamma" meant'):
+        _HandsOn.load(tmp_path / "model", gama=0.5)
