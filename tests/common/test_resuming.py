@@ -107,8 +107,8 @@ def test_every_attribute_of_a_resumed_model_is_what_it_was(cls, tmp_path):
     def make_env():
         return VecNormalize(DummyVecEnv([lambda n=n: Monitor(Succeeds(n)) for n in (3, 4)]))
 
-    model = small_model(make_env(), cls, **GRU)
-    _learn_until(model, 120, 70, tmp_path)
+    model = small_model(make_env(), cls, **GRU).learn(20)
+    _learn_until(model, 120, 90, tmp_path, reset_num_timesteps=False)
     resumed = cls.resume(tmp_path, make_env(), device="cpu")
     assert len(model.ep_success_buffer) > 0
     assert model._behaviour_state is not None
