@@ -7,8 +7,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from sb3_gac.envs import PreviousAction
-from tests.helpers import TwoViewBandit, TwoViewChoice
-from tests.helpers import Sampled
+from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice
 
 
 def test_discrete_actions_are_one_hot():
