@@ -19,7 +19,7 @@ from sb3_gac import GAC, AsymmetricSAC, DeploymentNormalizer, Learner, export_le
 from sb3_gac.common.networks import VectorExtractor
 from sb3_gac.envs import History
 from sb3_gac.verification import ExportError, draw_observations
-from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
+from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model, unlike_each_other
 from tests.sb3_contract.helpers import Renamed
 
 VECTOR = spaces.Box(-1, 1, (2,), np.float32)
@@ -42,7 +42,7 @@ class Scaled(TwoViewBandit):
 
 
 def _normalised():
-    return VecNormalize(make_vec_env(TwoViewBandit, 2, env_kwargs={"noise_std": 3.0}, seed=0))
+    return VecNormalize(make_vec_env(TwoViewBandit, 2, env_kwargs={"noise_std": 3.0}, seed=0), epsilon=0.3)
 
 
 def _recurrent(cell, env, **policy_kwargs):
@@ -116,6 +116,7 @@ def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
 def test_a_memory_is_carried_and_reset(kind, tmp_path):
     """500 sequences of 20 observations, twice."""
     model = WITH_MEMORY[kind]().learn(60)
+    unlike_each_other(model.policy, scale=0.2 if "image" in kind else 1.0)
     learner = Learner.load(export_learner(model, tmp_path / "learner.onnx"))
     script = th.jit.load(str(export_learner(model, tmp_path / "learner.pt")))
     sequence = [_drawn(model, 500, seed=step) for step in range(20)]
@@ -127,6 +128,8 @@ def test_a_memory_is_carried_and_reset(kind, tmp_path):
             scripted, scripted_state = script(th.as_tensor(raw["partial"]), scripted_state)
             for actual in (learner.act(raw), scripted.numpy()):
                 np.testing.assert_allclose(actual, expected, atol=1e-5)
+    forgetful, _ = model.predict(_normalised_as_in_training(model, sequence[-1]), deterministic=True)
+    assert not np.allclose(forgetful, expected, atol=1e-3), "the memory has a say"
     single = sequence[0]["partial"][0]
     with pytest.raises(ValueError, match=r"remembers 500 observations, but got 1: call reset\(\)"):
         learner.act(single)

@@ -100,6 +100,7 @@ def test_any_metric_counts(name, value, tmp_path):
 def test_observations_are_diagnosed_as_the_networks_see_them(tmp_path):
     env = VecNormalize(DummyVecEnv([TwoViewBandit]), clip_obs=0.01)
     model = small_model(env).learn(20)
+    env.obs_rms["partial"].mean[:] = 100.0  # all are far below it: the largest by size, whatever their sign
     model.set_logger(configure(str(tmp_path), []))
     with pytest.raises(DivergenceError) as raised:
         check_finite_metrics(model, {"kl": math.nan}, {}, {})

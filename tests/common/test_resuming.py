@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, CheckpointError, GACShare
+from sb3_gac.common.buffers import CUT
 from sb3_gac.envs import SensorNoise
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
 
@@ -107,8 +108,8 @@ def test_every_attribute_of_a_resumed_model_is_what_it_was(cls, tmp_path):
     def make_env():
         return VecNormalize(DummyVecEnv([lambda n=n: Monitor(Succeeds(n)) for n in (3, 4)]))
 
-    model = small_model(make_env(), cls, **GRU)
-    _learn_until(model, 120, 70, tmp_path)
+    model = small_model(make_env(), cls, **GRU).learn(20)
+    _learn_until(model, 120, 90, tmp_path, reset_num_timesteps=False)
     resumed = cls.resume(tmp_path, make_env(), device="cpu")
     assert len(model.ep_success_buffer) > 0
     assert model._behaviour_state is not None
@@ -213,6 +214,20 @@ def test_only_what_has_changed_of_the_buffer_is_written(tmp_path, monkeypatch):
     resumed.learn(10, reset_num_timesteps=False)
     resumed.save_checkpoint(tmp_path)
     assert len(before & {path.name for path in (tmp_path / "blocks").iterdir()}) == 8
+
+
+@pytest.mark.parametrize("rows_per_block", [1, 3])
+@pytest.mark.parametrize("buffer_size", [15, 1_000])
+def test_each_checkpoint_has_every_row_that_changed_since_the_one_before(rows_per_block, buffer_size, tmp_path, monkeypatch):
+    """The step before may have been cut since, and the newest next observation stands where the next step will be."""
+    model = small_model(_bandits(), buffer_size=buffer_size)
+    row_bytes = sum(rows[0].nbytes for rows in model.replay_buffer.rows_by_name().values())
+    monkeypatch.setattr("sb3_gac.common.resuming.BLOCK_BYTES", rows_per_block * row_bytes)
+    for steps, reset in ((10, True), (1, True), (2, False), (1, False), (3, True), (20, False)):
+        model.learn(steps, reset_num_timesteps=reset)
+        model.save_checkpoint(tmp_path)
+        _assert_same(model, GAC.resume(tmp_path, _bandits(), device="cpu"))
+    assert (model.replay_buffer.endings == CUT).any() == (buffer_size == 1_000)
 
 
 def test_notes_come_back(tmp_path):

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from sb3_gac.envs import PreviousAction
-from tests.helpers import TwoViewBandit, TwoViewChoice
+from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice
 
 
 def test_discrete_actions_are_one_hot():
@@ -54,3 +54,12 @@ def test_the_action_itself_is_passed_on():
     env = PreviousAction(Echo(TwoViewChoice()))
     env.reset()
     assert env.step(2)[-1]["action"] == 2
+
+
+def test_choices_that_do_not_count_from_zero_are_told_apart():
+    """Of three that are numbered 5, 6 and 7."""
+    entries = spaces.Dict(partial=spaces.Box(-1, 1, (2,), np.float32), privileged=spaces.Box(-1, 1, (1,), np.float32))
+    env = PreviousAction(Sampled(entries, spaces.Discrete(3, start=5)))
+    assert env.reset(seed=0)[0]["partial"][2:].tolist() == [0, 0, 0]
+    for place, action in enumerate((5, 6, 7)):
+        assert env.step(action)[0]["partial"][2:].tolist() == np.eye(3)[place].tolist()
