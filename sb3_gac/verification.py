@@ -11,6 +11,7 @@ from sb3_gac.common.actors import DeployedPolicy
 from sb3_gac.common.normalization import DeploymentNormalizer
 
 TOLERANCE = 1e-5
+SHARE_OF_OUTLIERS = 0.1  # of what is drawn of normalised entries: many are clipped
 STEPS = 8  # of the sequences that policies with a memory are compared on
 Entries = dict[str, np.ndarray]
 
@@ -66,7 +67,8 @@ def draw_observations(policy: DeployedPolicy, normalizer: DeploymentNormalizer |
         drawn = np.stack([np.asarray(space.sample()) for _ in range(n)])
         if np.issubdtype(drawn.dtype, np.floating):
             if normalizer is not None and key in normalizer.mean:
-                drawn = normalizer.mean[key] + rng.normal(scale=2.0, size=drawn.shape) * np.sqrt(normalizer.var[key])
+                scale = np.where(rng.random(drawn.shape) < SHARE_OF_OUTLIERS, 2.0 * normalizer.clip_obs, 2.0)
+                drawn = normalizer.mean[key] + rng.normal(scale=scale) * np.sqrt(normalizer.var[key])
             elif not ((space.high - space.low) < 1e3).all():  # type: ignore[attr-defined]
                 drawn = np.clip(rng.normal(scale=2.0, size=drawn.shape), space.low, space.high)  # type: ignore[attr-defined]
         entries[key] = drawn.astype(space.dtype)

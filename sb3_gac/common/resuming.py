@@ -44,6 +44,7 @@ PROGRESS = (
     "_rollout_steps",
     "_rollout_episodes",
     "_n_updates",
+    "_last_metrics",
     "_current_progress_remaining",
     "_last_obs",
     "_last_original_obs",

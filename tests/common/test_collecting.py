@@ -20,10 +20,12 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnRewardThreshold,
 )
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, EnvironmentFailedError, GACShare, GACWithoutQ, InvalidStepError
 from sb3_gac.common.buffers import CompactDictReplayBuffer
+from sb3_gac.common.env_guard import guard_of
 from sb3_gac.common.env_processes import WatchedPipe
 from tests.diary import Diary, DiaryEnv, assert_true_and_whole, stored_transitions
 from tests.helpers import TwoViewBandit, small_model
@@ -125,6 +127,58 @@ def test_callbacks_see_sb3s_names():
     for name in ("self", "env", "actions", "buffer_actions", "new_obs", "rewards", "dones", "infos", "replay_buffer"):
         assert name in seen[-1], name
     assert (seen[-1]["num_collected_steps"], seen[-1]["num_collected_episodes"]) == (1, 0)
+
+
+def test_a_new_training_begins_with_a_rollout_of_its_own():
+    """Not in the middle of the one that a callback ended."""
+    starts = []
+
+    class Starts(_StopAfter):
+        def _on_rollout_start(self):
+            starts.append(self.model.num_timesteps)
+
+    model = _model(Diary().envs(1), train_freq=6)
+    model.learn(1000, callback=Starts(4))
+    model.learn(12, callback=Starts(100))
+    assert starts == [0, 0, 6]
+
+
+def test_episodes_and_logs_are_counted(tmp_path):
+    from stable_baselines3.common.logger import configure
+
+    model = _model(Diary().envs(2, length=4))  # episodes of four and of five steps
+    logger = configure(str(tmp_path), ["csv"])
+    model.set_logger(logger)
+    model.learn(40, log_interval=3)  # ends at steps 4, 5, 8, 10, 12, 15, 16, 20 and 20
+    assert model._episode_num == 9
+    lines = (tmp_path / "progress.csv").read_text().splitlines()
+    columns = lines[0].split(",")
+    logged = [dict(zip(columns, line.split(","), strict=True)) for line in lines[1:]]
+    assert [row["time/total_timesteps"] for row in logged] == ["16", "30", "40"]
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_action_noise_starts_anew_with_each_episode(n_envs):
+    seen = []
+
+    class Noise(NormalActionNoise):
+        def reset(self):
+            seen.append("reset")
+
+    class Seen(VectorizedActionNoise):
+        def reset(self, indices=None):
+            seen.append(tuple(indices or ()))
+            super().reset(indices)
+
+    base = Noise(np.zeros(2), 0.1 * np.ones(2))
+    model = _model(Diary().envs(n_envs, length=4), action_noise=base if n_envs == 1 else Seen(base, n_envs))
+    model.learn(n_envs)
+    seen.clear()
+    model.learn(9 * n_envs, reset_num_timesteps=False)
+    at_ends = [entry for entry in seen if entry]
+    assert at_ends.count("reset") + at_ends.count((0,)) >= 2
+    if n_envs == 2:
+        assert [entry for entry in at_ends if entry != "reset"] == [(0,), (1,), (0,), (1,)]
 
 
 # --- interrupts ------------------------------------------------------------------------------------------------------------
@@ -394,6 +448,60 @@ def test_arrays_that_are_written_into_again(cls, policy, buffer, normalized, way
     env = _AliasedVecEnv(env) if way == "vectorised" else env
     model = _model(VecNormalize(env) if normalized else env, cls, policy, buffer).learn(40)
     assert_true_and_whole(model, diary)
+
+
+def test_a_wrapper_outside_that_writes_into_its_arrays_again():
+    diary = Diary()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = _model(_AliasedVecEnv(VecNormalize(diary.envs(2), norm_obs=False, norm_reward=False))).learn(40)
+    assert_true_and_whole(model, diary)
+
+
+def test_an_action_that_is_written_into_is_stored_as_it_was_chosen():
+    """Choices are handed on as they are, not scaled into new arrays."""
+
+    class Scribbling(VecEnvWrapper):
+        def reset(self):
+            return self.venv.reset()
+
+        def step_async(self, actions):
+            self.venv.step_async(actions.copy())
+            actions[...] = 0
+
+        def step_wait(self):
+            return self.venv.step_wait()
+
+    diary = Diary()
+    model = _model(Scribbling(diary.envs(2, discrete=True))).learn(40)
+    assert_true_and_whole(model, diary)
+    assert len(np.unique(model.replay_buffer.actions[:20])) == 3
+
+
+def test_a_guard_returns_arrays_of_its_own():
+    env = _AliasedVecEnv(Diary().envs(2))
+    _model(env)
+    first = env.reset()
+    kept = {key: value.copy() for key, value in first.items()}
+    results = []
+    for _ in range(5):
+        results.append(env.step(np.zeros((2, 2))))
+    np.testing.assert_equal(first, kept)
+    observation, rewards, dones, _ = results[0]
+    assert observation["partial"][:, 2].tolist() == [1, 1]
+    assert rewards.tolist() == [0, 0]
+    assert not dones.any()
+    assert results[-1][2].tolist() == [True, False]
+
+
+def test_steps_of_others_count_as_resets_do():
+    inner = DiaryEnv(Diary())
+    guard = guard_of(_model(inner).get_env())
+    assert guard.uses == 0
+    inner.reset()
+    assert guard.uses == 1
+    inner.step(np.zeros(2))
+    assert guard.uses == 2
 
 
 def test_one_that_does_so_in_another_process_is_said():
