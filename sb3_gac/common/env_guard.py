@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_gac.common.checks import as_sentence, entries_of, fault_of, index_bounds, is_finite
+from sb3_gac.common.checks import described, entries_of, fault_of, index_bounds, is_finite
 from sb3_gac.common.env_processes import KEPT, WatchedPipe, end_processes
 from sb3_gac.common.env_use import FINAL, EnvironmentUse, KeepingFinal, SuspiciousEnds
 
@@ -210,13 +210,13 @@ class EnvironmentGuard:
             self._failure = end_processes(self.base)
             return EnvironmentFailedError(self._failure)
         frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-        said = f"{type(error).__name__}: {error}"
+        said = described(error)
         if frames[-1].f_code in REWARD_IS_TAKEN and any(words in str(error) for words in NO_NUMBER):
-            said += ". Its reward must be a single number, such as float(reward[0])."
+            said += " Its reward must be a single number, such as float(reward[0])."
         for frame in frames:  # SB3's own loops know which environment they are at
             if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
                 return EnvironmentFailedError(
-                    f"Environment {frame.f_locals['env_idx']} raised {as_sentence(said)} {KEPT}: mend the "
+                    f"Environment {frame.f_locals['env_idx']} raised {said} {KEPT}: mend the "
                     f"environment; {GO_ON}, or set_env(...) first gives the model another one."
                 )
             if frame.f_code.co_name == "_stack_obs":
