@@ -9,15 +9,15 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_gac.common.actors import Actor
-from sb3_gac.common.compilation import compilable
-from sb3_gac.common.distributions import Distribution
-from sb3_gac.common.heads import LOG_STD_BOUNDS
-from sb3_gac.common.losses import learner_loss, learner_target, masked_mean
-from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
-from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
-from sb3_gac.common.roles import Roles
-from sb3_gac.common.training import Batch, Descent, Metrics, Slope, as_leaves, gradient_of
+from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
+from sb3_gac.base.roles import Roles
+from sb3_gac.base.update import Batch, Descent, Metrics, Slope, as_leaves, gradient_of
+from sb3_gac.math.distributions import Distribution
+from sb3_gac.math.losses import learner_loss, learner_target, masked_mean
+from sb3_gac.networks.actors import Actor
+from sb3_gac.networks.heads import LOG_STD_BOUNDS
+from sb3_gac.optim.compile import compilable
 
 
 class AsymmetricSACPolicy(AsymmetricPolicy):

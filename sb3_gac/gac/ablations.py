@@ -4,10 +4,10 @@ from typing import Any
 
 import torch as th
 
-from sb3_gac.common.losses import distillation_loss
 from sb3_gac.gac.gac import GAC
 from sb3_gac.gac.policies import ActionDistributions
 from sb3_gac.gac.update import StepInputs
+from sb3_gac.math.losses import distillation_loss
 
 
 class GACShare(GAC):

@@ -6,13 +6,13 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_gac.common.compilation import compilable
-from sb3_gac.common.distributions import Distribution
-from sb3_gac.common.dual import Coefficient
-from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target, masked_mean
-from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
-from sb3_gac.common.training import Backward, Batch, Descent, Metrics, Slope, as_leaves, gradient_of
+from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.base.update import Backward, Batch, Descent, Metrics, Slope, as_leaves, gradient_of
 from sb3_gac.gac.policies import ActionDistributions, GACPolicy
+from sb3_gac.math.distributions import Distribution
+from sb3_gac.math.losses import guided_target, guider_loss, learner_loss, learner_target, masked_mean
+from sb3_gac.optim.coefficients import Coefficient
+from sb3_gac.optim.compile import compilable
 
 
 class StepInputs(NamedTuple):

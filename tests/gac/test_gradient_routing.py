@@ -6,8 +6,8 @@ import torch as th
 from stable_baselines3.common.torch_layers import CombinedExtractor
 
 from sb3_gac import GAC, GACShare, GACWithoutQ
-from sb3_gac.common.distributions import TanhGaussian
-from sb3_gac.common.losses import critic_loss, distillation_loss, guider_loss, learner_loss, log_std_loss
+from sb3_gac.math.distributions import TanhGaussian
+from sb3_gac.math.losses import critic_loss, distillation_loss, guider_loss, learner_loss, log_std_loss
 from tests.helpers import small_model, unlike_each_other
 
 

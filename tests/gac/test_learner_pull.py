@@ -6,8 +6,8 @@ import pytest
 import torch as th
 
 from sb3_gac import GAC, GACShare, GACWithoutQ
-from sb3_gac.common.distributions import TanhGaussian
 from sb3_gac.gac.policies import ActionDistributions
+from sb3_gac.math.distributions import TanhGaussian
 from tests.gac.helpers import learner_inputs
 from tests.helpers import small_model
 
