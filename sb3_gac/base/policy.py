@@ -26,9 +26,11 @@ from sb3_gac.checks.entries import ObservationReader
 from sb3_gac.checks.values import check_integer
 from sb3_gac.math.distributions import Distribution
 from sb3_gac.networks.actors import BoundedPolicy, DeployedPolicy
-from sb3_gac.networks.critics import CriticEnsemble, DiscreteCriticEnsemble, EntryExtractor, VectorExtractor, polyak_average
+from sb3_gac.networks.critics import CriticEnsemble, DiscreteCriticEnsemble
+from sb3_gac.networks.encoders import EntryExtractor, VectorExtractor
 from sb3_gac.networks.recurrent import Memory
 from sb3_gac.optim.flat import FlatAdam, FlatParameters, TrainedParameters
+from sb3_gac.optim.polyak import polyak_average
 
 #: What each network of a behaviour policy remembers, shapes (B, S); ``None`` without memories, and before the first step
 BehaviourState: TypeAlias = tuple[np.ndarray, ...] | None

@@ -13,8 +13,8 @@ from torch import nn
 
 from sb3_gac.checks.entries import ObservationReader, check_is_observation
 from sb3_gac.math.distributions import Distribution
-from sb3_gac.networks.critics import RoleModel
 from sb3_gac.networks.heads import LOG_STD_BOUNDS, make_head
+from sb3_gac.networks.role_model import RoleModel
 
 
 class BoundedPolicy(BasePolicy):

@@ -15,7 +15,7 @@ from torch import nn
 from sb3_gac.checks.values import UnsupportedActionSpaceError, check_box_actions, check_range
 from sb3_gac.math.distributions import Categorical, TanhGaussian
 from sb3_gac.math.losses import log_std_loss
-from sb3_gac.networks.critics import Head
+from sb3_gac.networks.layers import Head
 
 LOG_STD_BOUNDS = (-5.0, 1.0)
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_gac.networks.critics import EnsembleLinear
+from sb3_gac.networks.layers import EnsembleLinear
 
 
 class Memory(nn.Module):

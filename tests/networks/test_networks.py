@@ -6,7 +6,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import CombinedExtractor
 
-from sb3_gac.networks.critics import CriticEnsemble, EnsembleLinear, VectorExtractor, polyak_average
+from sb3_gac.networks.critics import CriticEnsemble
+from sb3_gac.networks.encoders import VectorExtractor
+from sb3_gac.networks.layers import EnsembleLinear
+from sb3_gac.optim.polyak import polyak_average
 from tests.helpers import small_model
 
 SPACE = spaces.Dict(b=spaces.Box(-1, 1, (3,), np.float32), a=spaces.Box(-np.inf, np.inf, (2,), np.float32))
