@@ -31,4 +31,4 @@ class GACWithoutQ(GACShare):
         return False
 
     def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
-        return distillation_loss(now.guider.detach().kl(now.learner, self.kl_reduction), inputs.batch.mask)
+        return distillation_loss(now.guider.detach().kl_of_means(now.learner, self.kl_reduction), inputs.batch.mask)

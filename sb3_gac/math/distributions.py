@@ -61,8 +61,26 @@ class TanhGaussian(NamedTuple):
         action, log_prob = self.sample_with_log_prob(noise)
         return q_function(action), log_prob
 
-    def kl(self, other: "TanhGaussian", reduction: str = "mean") -> th.Tensor:
-        """KL(self || other), shape (\\*E), with the std of ``other``, which both have: see :func:`kl_shared_std`."""
+    def kl(self, other: "TanhGaussian", reduction: str = "sum") -> th.Tensor:
+        """
+        KL(self || other), shape (\\*E): of any two, whatever their stds; tanh is a bijection, so it is also the KL after it.
+
+        :param other: shapes (\\*E, A)
+        :param reduction: over action dimensions, "sum" (the definition) or "mean"
+        """
+        log_ratio = other.log_std - self.log_std
+        distance = (self.mean - other.mean) * th.exp(-other.log_std)
+        per_dimension = log_ratio + 0.5 * (th.exp(-2 * log_ratio) + distance.square() - 1)
+        return _reduced(per_dimension, reduction)
+
+    def kl_of_means(self, other: "TanhGaussian", reduction: str = "mean") -> th.Tensor:
+        """
+        KL(self || other), shape (\\*E), of two that share the std of ``other``, and that moves the means alone: see
+        :func:`kl_shared_std`.
+
+        :param other: shapes (\\*E, A)
+        :param reduction: over action dimensions, "sum" or "mean"
+        """
         return kl_shared_std(self.mean, other.mean, other.log_std.detach().exp(), reduction)
 
     def corrected(self, correction: "TanhGaussian") -> "TanhGaussian":
@@ -144,6 +162,10 @@ class Categorical(NamedTuple):
         log_probs = self.logits.log_softmax(dim=-1)
         return (log_probs.exp() * (log_probs - other.logits.log_softmax(dim=-1))).sum(dim=-1)
 
+    def kl_of_means(self, other: "Categorical", reduction: str = "sum") -> th.Tensor:
+        """KL(self || other), shape (\\*E): there is no std to share."""
+        return self.kl(other)
+
     def corrected(self, correction: "Categorical") -> "Categorical":
         """This distribution, as a constant, with its logits moved by the correction's."""
         return Categorical(self.logits.detach() + correction.logits)
@@ -170,7 +192,10 @@ def kl_shared_std(guider_mean: th.Tensor, learner_mean: th.Tensor, std: th.Tenso
     :param reduction: over action dimensions, "sum" (the definition) or "mean"
     :return: shape (\\*E)
     """
-    per_dimension = 0.5 * ((guider_mean - learner_mean) / std).square()
+    return _reduced(0.5 * ((guider_mean - learner_mean) / std).square(), reduction)
+
+
+def _reduced(per_dimension: th.Tensor, reduction: str) -> th.Tensor:
     return per_dimension.mean(dim=-1) if reduction == "mean" else per_dimension.sum(dim=-1)
 
 

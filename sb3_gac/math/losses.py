@@ -37,56 +37,36 @@ def masked_mean(values: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
     return th.where(mask > 0, values, th.zeros_like(values)).sum() / mask.sum().clamp(min=1)
 
 
-def guided_target(
-    reward: th.Tensor,
-    done: th.Tensor,
-    next_q: th.Tensor,
-    next_kl: th.Tensor,
-    next_log_prob: th.Tensor,
-    kl_coef: th.Tensor | float,
-    ent_coef: th.Tensor | float,
-    discount: th.Tensor | float,
-) -> th.Tensor:
-    """
-    Bellman target of the guided critics (eq. 12), with SAC's entropy term.
-
-    The expectation over a' of log mu - log pi is the KL divergence itself, so its closed form replaces the sampled
-    ratio of the printed equation: less variance, never negative.
-
-    :param reward: shape (\\*E)
-    :param done: 1 where the episode terminated (a time limit is not a termination), shape (\\*E)
-    :param next_q: target critics at (s', a'), a' from the guider, shape (N, \\*E)
-    :param next_kl: KL(mu(.|s') || pi(.|o')), shape (\\*E)
-    :param next_log_prob: log mu(a'|s'), shape (\\*E)
-    :param kl_coef: alpha
-    :param ent_coef: beta
-    :param discount: gamma, or gamma to the number of steps between s and s', scalar or (\\*E)
-    :return: shape (\\*E)
-    """
-    next_value = next_q.amin(dim=0) - kl_coef * next_kl - ent_coef * next_log_prob
-    return reward + discount * (1 - done) * next_value
-
-
-def learner_target(
+def soft_target(
+    *,
     reward: th.Tensor,
     done: th.Tensor,
     next_q: th.Tensor,
     discount: th.Tensor | float,
     next_log_prob: th.Tensor | float = 0.0,
     ent_coef: th.Tensor | float = 0.0,
+    next_kl: th.Tensor | float = 0.0,
+    kl_coef: th.Tensor | float = 0.0,
 ) -> th.Tensor:
     """
-    Bellman target of the learner critics (eq. 15): the plain return, without KL; with SAC's entropy term on request.
+    Bellman target of a policy's critics: the return of eq. 15, with SAC's entropy term and eq. 12's KL term on request.
+
+    The expectation over a' of log mu - log pi in eq. 12 is the KL divergence itself, so its closed form replaces the sampled
+    ratio of the printed equation: less variance, never negative.
 
     :param reward: shape (\\*E)
-    :param done: 1 where the episode terminated, shape (\\*E)
-    :param next_q: target critics at (s', a'), a' from the learner, shape (N, \\*E)
-    :param discount: scalar or (\\*E)
-    :param next_log_prob: log pi(a'|o'), shape (\\*E)
-    :param ent_coef: beta, or 0 for the equation as printed
+    :param done: 1 where the episode terminated (a time limit is not a termination), shape (\\*E)
+    :param next_q: target critics at (s', a'), a' from the policy, shape (N, \\*E)
+    :param discount: gamma, or gamma to the number of steps between s and s', scalar or (\\*E)
+    :param next_log_prob: log-probability of a', shape (\\*E)
+    :param ent_coef: beta
+    :param next_kl: KL(mu(.|s') || pi(.|o')), shape (\\*E)
+    :param kl_coef: alpha
     :return: shape (\\*E)
+    :raises ValueError: naming the tensor whose shape is not (\\*E)
     """
-    next_value = next_q.amin(dim=0) - ent_coef * next_log_prob
+    _check_shapes(next_q.shape[1:], reward=reward, done=done, discount=discount, next_log_prob=next_log_prob, next_kl=next_kl)
+    next_value = next_q.amin(dim=0) - kl_coef * next_kl - ent_coef * next_log_prob
     return reward + discount * (1 - done) * next_value
 
 
@@ -104,47 +84,29 @@ def critic_loss(q: th.Tensor, target: th.Tensor, mask: th.Tensor | None = None) 
     return 0.5 * masked_mean((q - target).square().sum(dim=0), mask)
 
 
-def guider_loss(
-    kl: th.Tensor,
-    log_prob: th.Tensor,
+def policy_loss(
+    *,
     q: th.Tensor,
-    kl_coef: th.Tensor | float,
-    ent_coef: th.Tensor | float,
-    mask: th.Tensor | None = None,
-) -> th.Tensor:
-    """
-    Guider objective (eq. 13) with SAC's entropy term.
-
-    :param kl: KL(mu || sg pi), shape (\\*E)
-    :param log_prob: log mu(a|s), a reparameterised, shape (\\*E)
-    :param q: guided critics at (s, a), frozen, shape (N, \\*E)
-    :param kl_coef: alpha
-    :param ent_coef: beta
-    :param mask: shape (\\*E)
-    :return: scalar
-    """
-    return masked_mean(kl_coef * kl + ent_coef * log_prob - q.amin(dim=0), mask)
-
-
-def learner_loss(
-    kl: th.Tensor | float,
-    q: th.Tensor,
-    kl_coef: th.Tensor | float,
     log_prob: th.Tensor | float = 0.0,
     ent_coef: th.Tensor | float = 0.0,
+    kl: th.Tensor | float = 0.0,
+    kl_coef: th.Tensor | float = 0.0,
     mask: th.Tensor | None = None,
 ) -> th.Tensor:
     """
-    Learner objective (eq. 16): follow the guider, climb the learner's own critics; with SAC's entropy term on request.
+    A policy's objective: climb its critics, with SAC's entropy term and a KL term on request. It is the guider's (eq. 13)
+    with KL(mu || sg pi), and the learner's (eq. 16) with KL(sg mu || pi).
 
-    :param kl: KL(sg mu || pi), shape (\\*E)
-    :param q: critics at (s, a), a from the learner and reparameterised, frozen, shape (N, \\*E)
+    :param q: critics at (s, a), a from the policy and reparameterised, frozen, shape (N, \\*E)
+    :param log_prob: log-probability of a, shape (\\*E)
+    :param ent_coef: beta
+    :param kl: divergence of the two policies, shape (\\*E)
     :param kl_coef: alpha
-    :param log_prob: log pi(a|o), shape (\\*E)
-    :param ent_coef: beta, or 0 for the equation as printed
     :param mask: shape (\\*E)
     :return: scalar
+    :raises ValueError: naming the tensor whose shape is not (\\*E)
     """
+    _check_shapes(q.shape[1:], log_prob=log_prob, kl=kl, mask=mask)
     return masked_mean(kl_coef * kl + ent_coef * log_prob - q.amin(dim=0), mask)
 
 
@@ -184,3 +146,18 @@ def dual_loss(log_coef: th.Tensor, violation: th.Tensor, mask: th.Tensor | None 
     :return: scalar
     """
     return -(log_coef.exp() * masked_mean(violation.detach(), mask)).sum()
+
+
+def _check_shapes(expected: th.Size, **tensors: th.Tensor | float | None) -> None:
+    """
+    Broadcasting would make a wrong shape a wrong number.
+
+    :param expected: of all tensors but scalars
+    :param tensors: name -> tensor, or a number
+    :raises ValueError: naming the one that has another shape
+    """
+    for name, tensor in tensors.items():
+        if isinstance(tensor, th.Tensor) and tensor.dim() > 0 and tensor.shape != expected:
+            raise ValueError(
+                f"{name} must have the shape {tuple(expected)}, as the critics' values have, got {tuple(tensor.shape)}."
+            )

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sb3_gac.math.distributions import Categorical, TanhGaussian, kl_shared_std, project_to_kl_ball
-from sb3_gac.math.losses import guided_target, guider_loss, learner_loss, learner_target
+from sb3_gac.math.losses import policy_loss, soft_target
 from tests.math.golden import assert_close, golden
 
 DTYPES = pytest.mark.parametrize("dtype", [th.float64, th.float32], ids=["float64", "float32"])
@@ -78,6 +78,33 @@ def test_kl_is_torchs_own():
     )
 
 
+@pytest.mark.parametrize("dtype", [th.float64, th.float32])
+def test_kl_of_any_two_gaussians_is_torchs_own(dtype):
+    """With stds of their own, in both directions; and its gradient moves means and stds."""
+    generator = th.Generator().manual_seed(0)
+    draw = [th.randn(5, 3, generator=generator, dtype=dtype) for _ in range(4)]
+    one, other = TanhGaussian(draw[0], 0.5 * draw[1]), TanhGaussian(draw[2], 0.5 * draw[3])
+    for p, q in ((one, other), (other, one)):
+        normals = [th.distributions.Normal(x.mean, x.log_std.exp()) for x in (p, q)]
+        expected = th.distributions.kl_divergence(*normals)
+        th.testing.assert_close(p.kl(q), expected.sum(-1))
+        th.testing.assert_close(p.kl(q, "mean"), expected.mean(-1))
+    leaves = [part.clone().requires_grad_() for part in (*one, *other)]
+    TanhGaussian(*leaves[:2]).kl(TanhGaussian(*leaves[2:])).sum().backward()
+    assert all((leaf.grad != 0).all() for leaf in leaves)
+
+
+def test_kl_of_means_is_the_kl_of_a_shared_std_and_moves_no_std():
+    mean, other_mean = th.tensor([[0.5, -1.0]], requires_grad=True), th.tensor([[0.0, 1.0]], requires_grad=True)
+    log_std = th.tensor([[0.2, -0.3]], requires_grad=True)
+    one, other = TanhGaussian(mean, log_std), TanhGaussian(other_mean, log_std)
+    for reduction in ("mean", "sum"):
+        th.testing.assert_close(one.kl_of_means(other, reduction), one.kl(other, reduction))
+    one.kl_of_means(other).sum().backward()
+    assert log_std.grad is None
+    assert (mean.grad != 0).all()
+
+
 @DTYPES
 def test_kl_of_the_residual_guider_is_half_its_squared_correction(dtype):
     case = golden("residual_guider", dtype)
@@ -135,12 +162,14 @@ def test_categorical_expectations_and_losses(dtype):
     q_guided, log_prob = guider.expectation(lambda actions: case["q_guided"], noise)
     assert_close(-log_prob, case["entropy_guider"])
     kl_coef, ent_coef = case["kl_coef"], case["ent_coef"]
-    assert_close(guider_loss(kl, log_prob, q_guided, kl_coef, ent_coef), case["guider_loss_eq13"])
+    extra = {"log_prob": log_prob, "ent_coef": ent_coef}
+    assert_close(policy_loss(q=q_guided, kl=kl, kl_coef=kl_coef, **extra), case["guider_loss_eq13"])
     q_learner, _ = learner.expectation(lambda actions: case["q_learner"], noise)
-    assert_close(learner_loss(kl, q_learner, kl_coef), case["learner_loss_eq16"])
-    target = guided_target(case["reward"], case["done"], q_guided, kl, log_prob, kl_coef, ent_coef, case["gamma"])
-    assert_close(target, case["guided_target_eq12"])
-    assert_close(learner_target(case["reward"], case["done"], q_learner, case["gamma"]), case["learner_target_eq15"])
+    assert_close(policy_loss(q=q_learner, kl=kl, kl_coef=kl_coef), case["learner_loss_eq16"])
+    given = {"reward": case["reward"], "done": case["done"], "discount": case["gamma"]}
+    extra = {"next_log_prob": log_prob, "ent_coef": ent_coef, "next_kl": kl, "kl_coef": kl_coef}
+    assert_close(soft_target(next_q=q_guided, **given, **extra), case["guided_target_eq12"])
+    assert_close(soft_target(next_q=q_learner, **given), case["learner_target_eq15"])
 
 
 def test_kl_of_choices_has_a_direction():

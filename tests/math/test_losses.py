@@ -14,15 +14,15 @@ DTYPES = pytest.mark.parametrize("dtype", [th.float64, th.float32], ids=["float6
 @DTYPES
 def test_guided_target_eq12(dtype):
     case = golden("targets", dtype)
-    target = losses.guided_target(
-        case["reward"],
-        case["done"],
-        case["q_target"],
-        case["kl"],
-        case["log_prob"],
-        case["kl_coef"],
-        case["ent_coef"],
-        case["gamma"],
+    target = losses.soft_target(
+        reward=case["reward"],
+        done=case["done"],
+        next_q=case["q_target"],
+        discount=case["gamma"],
+        next_log_prob=case["log_prob"],
+        ent_coef=case["ent_coef"],
+        next_kl=case["kl"],
+        kl_coef=case["kl_coef"],
     )
     assert_close(target, case["guided_target_eq12"])
 
@@ -30,17 +30,18 @@ def test_guided_target_eq12(dtype):
 @DTYPES
 def test_learner_target_eq15(dtype):
     case = golden("targets", dtype)
-    target = losses.learner_target(case["reward"], case["done"], case["q_target"], case["gamma"])
+    target = losses.soft_target(reward=case["reward"], done=case["done"], next_q=case["q_target"], discount=case["gamma"])
     assert_close(target, case["learner_target_eq15"])
 
 
 @DTYPES
 def test_guider_and_learner_objectives(dtype):
     case = golden("actor_losses", dtype)
-    coefficients = (case["kl_coef"], case["ent_coef"])
-    assert_close(losses.guider_loss(case["kl"], case["log_prob"], case["q_guider"], *coefficients), case["guider_loss_eq13"])
-    assert_close(losses.learner_loss(case["kl"], case["q_learner"], case["kl_coef"]), case["learner_loss_eq16"])
-    assert_close(losses.learner_loss(case["kl"], case["q_guider"], case["kl_coef"]), case["learner_loss_share"])
+    kl = {"kl": case["kl"], "kl_coef": case["kl_coef"]}
+    entropy = {"log_prob": case["log_prob"], "ent_coef": case["ent_coef"]}
+    assert_close(losses.policy_loss(q=case["q_guider"], **entropy, **kl), case["guider_loss_eq13"])
+    assert_close(losses.policy_loss(q=case["q_learner"], **kl), case["learner_loss_eq16"])
+    assert_close(losses.policy_loss(q=case["q_guider"], **kl), case["learner_loss_share"])
     assert_close(losses.distillation_loss(case["kl"]), case["learner_loss_eq14"])
 
 
@@ -75,15 +76,19 @@ def test_dual_loss_leaves_the_violation_alone():
 def test_a_termination_cuts_the_future_and_a_time_limit_does_not():
     reward, next_q = th.tensor([1.0, 1.0]), th.tensor([[10.0, 10.0], [20.0, 20.0]])
     terminated = th.tensor([1.0, 0.0])
-    assert losses.learner_target(reward, terminated, next_q, 0.9).tolist() == pytest.approx([1.0, 10.0])
+    assert losses.soft_target(reward=reward, done=terminated, next_q=next_q, discount=0.9).tolist() == pytest.approx(
+        [1.0, 10.0]
+    )
     # 10 - 2 * 0.5 - 0.1 * 3 = 8.7
     kl, log_prob = th.full((2,), 0.5), th.full((2,), 3.0)
-    target = losses.guided_target(reward, terminated, next_q, kl, log_prob, 2.0, 0.1, 0.9)
+    extra = {"next_kl": kl, "kl_coef": 2.0, "next_log_prob": log_prob, "ent_coef": 0.1}
+    target = losses.soft_target(reward=reward, done=terminated, next_q=next_q, discount=0.9, **extra)
     assert target.tolist() == pytest.approx([1.0, 1.0 + 0.9 * 8.7])
 
 
 def test_discount_may_differ_per_transition():
-    target = losses.learner_target(th.zeros(2), th.zeros(2), th.ones(1, 2), th.tensor([0.9, 0.81]))
+    discount = th.tensor([0.9, 0.81])
+    target = losses.soft_target(reward=th.zeros(2), done=th.zeros(2), next_q=th.ones(1, 2), discount=discount)
     assert target.tolist() == pytest.approx([0.9, 0.81])
 
 
@@ -95,8 +100,7 @@ def test_log_std_loss_by_hand():
 def _sequence_losses(mask, kl, log_prob, q, log_std):
     return [
         losses.critic_loss(q, kl, mask),
-        losses.guider_loss(kl, log_prob, q, 0.7, 0.2, mask),
-        losses.learner_loss(kl, q, 0.7, log_prob, 0.2, mask),
+        losses.policy_loss(q=q, log_prob=log_prob, ent_coef=0.2, kl=kl, kl_coef=0.7, mask=mask),
         losses.distillation_loss(kl, mask),
         losses.log_std_loss(log_std, th.zeros_like(log_std), mask),
         losses.dual_loss(th.zeros(1), kl, mask),
@@ -127,6 +131,27 @@ def test_padding_gets_no_gradient():
 def test_entropy_terms_of_the_learner_by_hand():
     q, log_prob = th.tensor([[2.0], [3.0]]), th.tensor([0.5])
     # 1 + 0.9 * (2 - 0.2 * 0.5) = 2.71
-    assert losses.learner_target(th.ones(1), th.zeros(1), q, 0.9, log_prob, 0.2).item() == pytest.approx(2.71)
+    target = losses.soft_target(
+        reward=th.ones(1), done=th.zeros(1), next_q=q, discount=0.9, next_log_prob=log_prob, ent_coef=0.2
+    )
+    assert target.item() == pytest.approx(2.71)
     # 0.7 * 0.1 + 0.2 * 0.5 - 2 = -1.83
-    assert losses.learner_loss(th.tensor([0.1]), q, 0.7, log_prob, 0.2).item() == pytest.approx(-1.83)
+    loss = losses.policy_loss(q=q, log_prob=log_prob, ent_coef=0.2, kl=th.tensor([0.1]), kl_coef=0.7)
+    assert loss.item() == pytest.approx(-1.83)
+
+
+@pytest.mark.parametrize("name", ["reward", "done", "discount", "next_log_prob", "next_kl"])
+@pytest.mark.parametrize("shape", [(4, 1), (1, 4), (1,), (5,)])
+def test_a_target_of_another_shape_is_named(name, shape):
+    """(B, 1) beside (B,) would broadcast to (B, B) without a word."""
+    tensors = {key: th.ones(4) for key in ("reward", "done", "discount", "next_log_prob", "next_kl")}
+    tensors[name] = th.ones(shape)
+    with pytest.raises(ValueError, match=rf"^{name} must have the shape \(4,\)"):
+        losses.soft_target(next_q=th.ones(2, 4), ent_coef=0.1, kl_coef=0.1, **tensors)
+
+
+@pytest.mark.parametrize("name", ["log_prob", "kl", "mask"])
+@pytest.mark.parametrize("shape", [(4, 1), (1, 4), (1,), (5,)])
+def test_an_objective_of_another_shape_is_named(name, shape):
+    with pytest.raises(ValueError, match=rf"^{name} must have the shape \(4,\)"):
+        losses.policy_loss(q=th.ones(2, 4), ent_coef=0.1, kl_coef=0.1, **{name: th.ones(shape)})
