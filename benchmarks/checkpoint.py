@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gac import ExactCheckpointCallback, SeededEvalCallback
-from sb3_gac.common.checkpoint_files import checkpoints
+from sb3_gac.checkpoint.files import checkpoints
 
 CHECKPOINT = "checkpoint"
 #: A model and its evaluations so far

@@ -15,7 +15,7 @@ from stable_baselines3 import SAC
 
 import sb3_gac
 from benchmarks.suite import HYPERPARAMS, RunSpec, check_keys, is_number_as_text, read_preset
-from sb3_gac.common.arguments import constructor_parameters
+from sb3_gac.checks.arguments import constructor_parameters
 
 _OTHERS_CLASSES = {"stable_baselines3.SAC": SAC}
 POLICY = "MultiInputPolicy"

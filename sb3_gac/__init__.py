@@ -8,47 +8,50 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from sb3_gac.moved import find_moved_modules
 from sb3_gac.version import __version__
+
+find_moved_modules()
 
 if find_spec("gymnasium") is not None:
     from sb3_gac import envs
 
 if TYPE_CHECKING:
+    from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
+    from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
-    from sb3_gac.common.buffers import CompactDictReplayBuffer
-    from sb3_gac.common.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
-    from sb3_gac.common.checkpoint_callback import ExactCheckpointCallback
-    from sb3_gac.common.checkpoint_files import CheckpointError
-    from sb3_gac.common.divergence import DivergenceError
-    from sb3_gac.common.env_guard import EnvironmentFailedError, InvalidStepError
-    from sb3_gac.common.episodes import EpisodeReplayBuffer
-    from sb3_gac.common.normalization import DeploymentNormalizer
-    from sb3_gac.export import export_learner
+    from sb3_gac.checkpoint.files import CheckpointError
+    from sb3_gac.checks.divergence import DivergenceError
+    from sb3_gac.checks.environments import EnvironmentFailedError, InvalidStepError
+    from sb3_gac.deploy.export import export_learner
+    from sb3_gac.deploy.normalization import DeploymentNormalizer
     from sb3_gac.gac.ablations import GACShare, GACWithoutQ
     from sb3_gac.gac.gac import GAC
     from sb3_gac.gac.policies import GACPolicy
     from sb3_gac.gac.presets import PRESETS, preset
     from sb3_gac.learner import Learner
+    from sb3_gac.replay.buffer import CompactDictReplayBuffer
+    from sb3_gac.replay.episodes import EpisodeReplayBuffer
 
 _WHERE = {
     "GAC": "gac.gac",
     "PRESETS": "gac.presets",
     "AsymmetricSAC": "baselines.asymmetric_sac",
-    "CheckpointError": "common.checkpoint_files",
-    "CompactDictReplayBuffer": "common.buffers",
-    "DeploymentNormalizer": "common.normalization",
-    "DivergenceError": "common.divergence",
-    "EnvironmentFailedError": "common.env_guard",
-    "EpisodeReplayBuffer": "common.episodes",
-    "ExactCheckpointCallback": "common.checkpoint_callback",
+    "CheckpointError": "checkpoint.files",
+    "CompactDictReplayBuffer": "replay.buffer",
+    "DeploymentNormalizer": "deploy.normalization",
+    "DivergenceError": "checks.divergence",
+    "EnvironmentFailedError": "checks.environments",
+    "EpisodeReplayBuffer": "replay.episodes",
+    "ExactCheckpointCallback": "base.checkpoint_callback",
     "GACPolicy": "gac.policies",
     "GACShare": "gac.ablations",
     "GACWithoutQ": "gac.ablations",
-    "GuiderLearnerEvalCallback": "common.callbacks",
-    "InvalidStepError": "common.env_guard",
+    "GuiderLearnerEvalCallback": "base.callbacks",
+    "InvalidStepError": "checks.environments",
     "Learner": "learner",
-    "SeededEvalCallback": "common.callbacks",
-    "export_learner": "export",
+    "SeededEvalCallback": "base.callbacks",
+    "export_learner": "deploy.export",
     "preset": "gac.presets",
 }
 

@@ -26,7 +26,7 @@ METADATA_KEY = "sb3_gac"
 
 class Learner:
     """
-    A policy that was written by :func:`sb3_gac.export.export_learner`; it acts deterministically.
+    A policy that was written by :func:`sb3_gac.deploy.export.export_learner`; it acts deterministically.
 
     :param session: of onnxruntime
     """
@@ -43,7 +43,7 @@ class Learner:
     @classmethod
     def load(cls, path: str | Path) -> "Learner":
         """
-        :param path: of a file that :func:`sb3_gac.export.export_learner` wrote
+        :param path: of a file that :func:`sb3_gac.deploy.export.export_learner` wrote
         :raises ValueError: if it is another file
         """
         options = onnxruntime.SessionOptions()
@@ -53,7 +53,7 @@ class Learner:
         except Exception as error:
             raise ValueError(f"{path} is not an ONNX file that onnxruntime can read: {error}") from error
         if METADATA_KEY not in session.get_modelmeta().custom_metadata_map:
-            raise ValueError(f"{path} was not written by sb3_gac.export.export_learner: it has no description of its inputs.")
+            raise ValueError(f"{path} was not written by sb3_gac.export_learner: it has no description of its inputs.")
         return cls(session)
 
     def reset(self) -> None:

@@ -28,7 +28,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gac import GAC, PRESETS, ExactCheckpointCallback, GuiderLearnerEvalCallback, __version__, preset
-from sb3_gac.common.checkpoint_files import checkpoints
+from sb3_gac.checkpoint.files import checkpoints
 from sb3_gac.envs import PARTIAL
 from sb3_gac.envs.mujoco import TASKS
 

@@ -10,14 +10,22 @@ import sb3_gac
 
 ROOT = Path(sb3_gac.__file__).parents[1]
 BASELINES = sorted({path.stem for path in (ROOT / "sb3_gac/baselines").glob("[!_]*")})
+#: Room -> rooms that it may import
+ROOMS = {
+    "math": "math",
+    "checks": "checks",
+    "optim": "optim|math|checks",
+    "networks": "networks|math|checks",
+    "replay": "replay|checks",
+    "checkpoint": "checkpoint|envs",
+    "base": "base|math|checks|optim|networks|replay|checkpoint|envs",
+    "deploy": "deploy|base|checks|networks|envs|learner|version",
+}
 FORBIDDEN = {
-    "sb3_gac/common/losses.py": r"sb3_gac",
-    "sb3_gac/common/distributions.py": r"sb3_gac",
-    "sb3_gac/common/dual.py": r"sb3_gac(?!\.common\.(checks|flat|losses)\b)",
-    "sb3_gac/common/**/*.py": r"sb3_gac(?!\.(common|envs)\b)",
+    **{f"sb3_gac/{room}/**/*.py": rf"sb3_gac(?!\.({allowed})\b)" for room, allowed in ROOMS.items()},
     "sb3_gac/envs/**/*.py": r"torch\b|stable_baselines3|sb3_gac(?!\.envs\b)",
     **{
-        f"sb3_gac/baselines/{pattern.format(name)}": rf"sb3_gac(?!\.(common|envs|version|baselines\.{name})\b)"
+        f"sb3_gac/baselines/{pattern.format(name)}": rf"sb3_gac(?!\.({ROOMS['base']}|version|baselines\.{name})\b)"
         for name in BASELINES
         for pattern in ("{}.py", "{}/**/*.py")
     },

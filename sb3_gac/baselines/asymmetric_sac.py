@@ -9,15 +9,15 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_gac.common.actors import Actor
-from sb3_gac.common.compilation import compilable
-from sb3_gac.common.distributions import Distribution
-from sb3_gac.common.heads import LOG_STD_BOUNDS
-from sb3_gac.common.losses import learner_loss, learner_target, masked_mean
-from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
-from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
-from sb3_gac.common.roles import Roles
-from sb3_gac.common.training import Batch, Descent, Metrics, Slope, as_leaves, gradient_of
+from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
+from sb3_gac.base.roles import Roles
+from sb3_gac.base.update import Batch, Descent, Metrics, Slope, as_leaves, gradient_of
+from sb3_gac.math.distributions import Distribution
+from sb3_gac.math.losses import masked_mean, policy_loss, soft_target
+from sb3_gac.networks.actors import Actor
+from sb3_gac.networks.heads import LOG_STD_BOUNDS
+from sb3_gac.optim.compile import compilable
 
 
 class AsymmetricSACPolicy(AsymmetricPolicy):
@@ -121,12 +121,19 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
     @th.no_grad()
     def _target(self, batch: Batch, later: Distribution, noise: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
         next_q, log_prob = later.expectation(batch.values_after(self.policy.critic_target), noise)
-        return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, ent_coef)
+        return soft_target(
+            reward=batch.rewards,
+            done=batch.dones,
+            next_q=next_q,
+            discount=batch.discounts,
+            next_log_prob=log_prob,
+            ent_coef=ent_coef,
+        )
 
     @compilable
     def _actor_slope(self, batch: Batch, now: Distribution, noise: th.Tensor, ent_coef: th.Tensor) -> tuple[Slope, th.Tensor]:
         """Of the actor's loss; with its log-probability, detached, shape (\\*E)."""
         outputs = as_leaves(now)
         q, log_prob = outputs.expectation(batch.values_at(self.policy.critic), noise)
-        loss = learner_loss(0.0, q, 0.0, log_prob, ent_coef, batch.mask)
+        loss = policy_loss(q=q, log_prob=log_prob, ent_coef=ent_coef, mask=batch.mask)
         return Slope(gradient_of(loss, outputs), {"actor_loss": loss.detach()}), log_prob.detach()

@@ -4,10 +4,10 @@ from typing import Any
 
 import torch as th
 
-from sb3_gac.common.losses import distillation_loss
 from sb3_gac.gac.gac import GAC
 from sb3_gac.gac.policies import ActionDistributions
 from sb3_gac.gac.update import StepInputs
+from sb3_gac.math.losses import distillation_loss
 
 
 class GACShare(GAC):
@@ -31,4 +31,4 @@ class GACWithoutQ(GACShare):
         return False
 
     def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
-        return distillation_loss(now.guider.detach().kl(now.learner, self.kl_reduction), inputs.batch.mask)
+        return distillation_loss(now.guider.detach().kl_of_means(now.learner, self.kl_reduction), inputs.batch.mask)

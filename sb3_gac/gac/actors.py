@@ -6,8 +6,8 @@ import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_gac.common.actors import Actor, DeployedPolicy, RolePolicy
-from sb3_gac.common.distributions import Distribution, TanhGaussian, project_to_kl_ball
+from sb3_gac.math.distributions import Distribution, TanhGaussian, project_to_kl_ball
+from sb3_gac.networks.actors import Actor, DeployedPolicy, RolePolicy
 
 DELTA_INIT_SCALE = 0.01
 

@@ -11,15 +11,15 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_gac.common.arguments import PlainSchedule
-from sb3_gac.common.checks import check_choice, check_not_negative, check_positive, check_schedule
-from sb3_gac.common.distributions import KL_REDUCTIONS
-from sb3_gac.common.dual import make_coefficient
-from sb3_gac.common.entries import check_is_observation
-from sb3_gac.common.roles import RoleKeys
+from sb3_gac.base.roles import RoleKeys
+from sb3_gac.checks.arguments import PlainSchedule
+from sb3_gac.checks.entries import check_is_observation
+from sb3_gac.checks.values import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.gac.actors import GUIDERS
 from sb3_gac.gac.policies import STD_OF, GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
 from sb3_gac.gac.update import GuidedUpdate
+from sb3_gac.math.distributions import KL_REDUCTIONS
+from sb3_gac.optim.coefficients import make_coefficient
 
 KL_COEF_START = 1.0
 

@@ -8,12 +8,12 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_gac.common.distributions import Distribution
-from sb3_gac.common.heads import LOG_STD_BOUNDS
-from sb3_gac.common.networks import CriticEnsemble
-from sb3_gac.common.policies import AsymmetricPolicy, BehaviourState
-from sb3_gac.common.roles import Roles
+from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
+from sb3_gac.base.roles import Roles
 from sb3_gac.gac.actors import GUIDERS, Learner, LearnerAsActor
+from sb3_gac.math.distributions import Distribution
+from sb3_gac.networks.critics import CriticEnsemble
+from sb3_gac.networks.heads import LOG_STD_BOUNDS
 
 STD_OF = ("learner", "guider")
 
@@ -43,7 +43,7 @@ class GACPolicy(AsymmetricPolicy):
     :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}`` or ``{"guider", "learner", "critic"}``
     :param activation_fn: between layers
     :param guider: "residual" or "independent", a key of ``GUIDERS``
-    :param role_keys: role -> observation entries, see :func:`sb3_gac.common.roles.resolve_role_keys`
+    :param role_keys: role -> observation entries, see :func:`sb3_gac.base.roles.resolve_role_keys`
     :param max_kl: hard bound on KL(guider || learner), or ``None``
     :param kl_reduction: how that KL is reduced over action dimensions, "mean" or "sum"
     :param learner_critics: whether the learner has critics of its own

@@ -6,13 +6,13 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_gac.common.compilation import compilable
-from sb3_gac.common.distributions import Distribution
-from sb3_gac.common.dual import Coefficient
-from sb3_gac.common.losses import guided_target, guider_loss, learner_loss, learner_target, masked_mean
-from sb3_gac.common.off_policy import AsymmetricOffPolicyAlgorithm
-from sb3_gac.common.training import Backward, Batch, Descent, Metrics, Slope, as_leaves, gradient_of
+from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.base.update import Backward, Batch, Descent, Metrics, Slope, as_leaves, gradient_of
 from sb3_gac.gac.policies import ActionDistributions, GACPolicy
+from sb3_gac.math.distributions import Distribution
+from sb3_gac.math.losses import masked_mean, policy_loss, soft_target
+from sb3_gac.optim.coefficients import Coefficient
+from sb3_gac.optim.compile import compilable
 
 
 class StepInputs(NamedTuple):
@@ -119,8 +119,10 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         outputs = as_leaves(inputs.guider)
         now = self.policy.combine(outputs, inputs.learner)
         q, log_prob = now.guider.expectation(inputs.batch.values_at(self.policy.guider_critic), noise)
-        kl = now.guider.kl(now.learner, self.kl_reduction)
-        loss = guider_loss(kl, log_prob, q, inputs.kl_coef, inputs.ent_coef, inputs.batch.mask)
+        kl = now.guider.kl_of_means(now.learner, self.kl_reduction)
+        loss = policy_loss(
+            q=q, log_prob=log_prob, ent_coef=inputs.ent_coef, kl=kl, kl_coef=inputs.kl_coef, mask=inputs.batch.mask
+        )
         return Slope(gradient_of(loss, outputs), {"guider_loss": loss.detach()}), kl.detach(), log_prob.detach()
 
     @th.no_grad()
@@ -128,9 +130,17 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         """Eq. 12, shape (\\*E)."""
         batch, later = inputs.batch, self.policy.combine(*inputs.later)
         next_q, log_prob = later.guider.expectation(batch.values_after(self.policy.guider_critic_target), noise)
-        next_kl = later.guider.kl(later.learner, self.kl_reduction)
-        coefficients = (inputs.kl_coef, inputs.ent_coef)
-        return guided_target(batch.rewards, batch.dones, next_q, next_kl, log_prob, *coefficients, batch.discounts)
+        next_kl = later.guider.kl_of_means(later.learner, self.kl_reduction)
+        return soft_target(
+            reward=batch.rewards,
+            done=batch.dones,
+            next_q=next_q,
+            discount=batch.discounts,
+            next_log_prob=log_prob,
+            ent_coef=inputs.ent_coef,
+            next_kl=next_kl,
+            kl_coef=inputs.kl_coef,
+        )
 
     # --- the learner's half -----------------------------------------------------------------------------------------
 
@@ -169,7 +179,14 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         batch = inputs.batch
         learner = self.policy.combine(*inputs.later).learner
         next_q, log_prob = learner.expectation(batch.values_after(self.policy.critic_target), noise)
-        return learner_target(batch.rewards, batch.dones, next_q, batch.discounts, log_prob, self._learner_ent_coef(inputs))
+        return soft_target(
+            reward=batch.rewards,
+            done=batch.dones,
+            next_q=next_q,
+            discount=batch.discounts,
+            next_log_prob=log_prob,
+            ent_coef=self._learner_ent_coef(inputs),
+        )
 
     def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
         """
@@ -183,8 +200,9 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         q, log_prob = now.learner.expectation(inputs.batch.values_at(self.policy.critic), noise)
         kl: th.Tensor | float = 0.0
         if self.learner_pull:
-            kl = self.learner_pull * now.guider.detach().kl(now.learner, self.kl_reduction)
-        return learner_loss(kl, q, inputs.kl_coef, log_prob, self._learner_ent_coef(inputs), inputs.batch.mask)
+            kl = self.learner_pull * now.guider.detach().kl_of_means(now.learner, self.kl_reduction)
+        ent_coef = self._learner_ent_coef(inputs)
+        return policy_loss(q=q, log_prob=log_prob, ent_coef=ent_coef, kl=kl, kl_coef=inputs.kl_coef, mask=inputs.batch.mask)
 
     def _learner_ent_coef(self, inputs: StepInputs) -> th.Tensor | float:
         return inputs.ent_coef if self.learner_entropy else 0.0

@@ -14,7 +14,7 @@ from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.models import LoopedGRU, recurrent_step_flops, step_flops
 from benchmarks.profiles import cumulative_seconds, env_step, profile_rollout, profile_step
 from benchmarks.speed import compare_buffers, compare_checkpoints, compare_deployment, compare_recurrent, compare_steps
-from sb3_gac.common.flat import FlatAdam
+from sb3_gac.optim.flat import FlatAdam
 
 
 def test_arithmetic_of_a_step_by_hand():

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_gac.common.training import Batch
+from sb3_gac.base.update import Batch
 from sb3_gac.gac.update import StepInputs
 
 

@@ -6,8 +6,8 @@ import torch as th
 from stable_baselines3.common.torch_layers import CombinedExtractor
 
 from sb3_gac import GAC, GACShare, GACWithoutQ
-from sb3_gac.common.distributions import TanhGaussian
-from sb3_gac.common.losses import critic_loss, distillation_loss, guider_loss, learner_loss, log_std_loss
+from sb3_gac.math.distributions import TanhGaussian
+from sb3_gac.math.losses import critic_loss, distillation_loss, log_std_loss, policy_loss
 from tests.helpers import small_model, unlike_each_other
 
 
@@ -43,9 +43,11 @@ def model(request):
 def test_guider_loss_moves_the_guider_alone(model):
     obs = _observations()
     guider, learner, _ = model.policy.distributions(obs)
-    kl = guider.kl(learner.detach())
+    kl = guider.kl_of_means(learner.detach())
     log_prob = guider.sample_with_log_prob(th.randn_like(guider.mean))[1]
-    assert _reached(model.policy, guider_loss(kl, log_prob, th.zeros(2, 8), 1.0, 0.1)) == {"guider"}
+    assert _reached(model.policy, policy_loss(q=th.zeros(2, 8), log_prob=log_prob, ent_coef=0.1, kl=kl, kl_coef=1.0)) == {
+        "guider"
+    }
 
 
 @pytest.mark.parametrize(("guider", "std_of"), FORMS)
@@ -59,7 +61,7 @@ def test_a_bound_on_kl_moves_neither_the_learner_nor_a_borrowed_std(guider, std_
 
 def test_learner_kl_moves_the_learner_alone_and_not_its_log_std_head(model):
     guider, learner, _ = model.policy.distributions(_observations())
-    kl = TanhGaussian(guider.mean.detach() + 0.1, guider.log_std).kl(learner)
+    kl = TanhGaussian(guider.mean.detach() + 0.1, guider.log_std).kl_of_means(learner)
     assert _reached(model.policy, distillation_loss(kl)) == {"learner"}
 
 
@@ -68,7 +70,7 @@ def test_learner_q_term_has_a_gradient_for_the_mean_and_for_the_std_unless_it_is
     _, learner, _ = model.policy.distributions(obs)
     q = model.policy.learner_critic(obs, learner.sample())
     own = {"learner_log_std"} if model.std_of == "learner" else set()
-    assert _reached(model.policy, learner_loss(th.zeros(8), q, 1.0)) == {"learner", "learner_critic"} | own
+    assert _reached(model.policy, policy_loss(q=q, kl=th.zeros(8), kl_coef=1.0)) == {"learner", "learner_critic"} | own
 
 
 def test_guider_q_term_has_a_gradient_for_the_mean_and_for_the_std_unless_it_is_borrowed(model):
@@ -103,7 +105,7 @@ def test_each_critic_loss_moves_its_own_critics(model, part):
 
 def test_kl_does_not_move_the_std(model):
     guider, learner, _ = model.policy.distributions(_observations())
-    kl = TanhGaussian(guider.mean + 0.1, guider.log_std).kl(learner.detach())
+    kl = TanhGaussian(guider.mean + 0.1, guider.log_std).kl_of_means(learner.detach())
     for parameter in model.policy.parameters():
         parameter.grad = None
     kl.sum().backward()

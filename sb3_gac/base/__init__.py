@@ -1,0 +1,1 @@
+"""What all algorithms with a privileged view share."""

@@ -1,0 +1,127 @@
+"""Checkpoints on a schedule, and when the process is told to end."""
+
+import signal
+import threading
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_gac.base.resuming import ResumableAlgorithm
+from sb3_gac.checks.environments import EnvironmentFailedError
+from sb3_gac.checks.values import as_sentence
+
+_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+
+
+class ExactCheckpointCallback(BaseCallback):
+    """
+    Calls :meth:`ResumableAlgorithm.save_checkpoint` where training can be taken up to the bit: before a rollout starts.
+
+    On SIGTERM, as pre-empting schedulers send it, and on Ctrl-C the step is finished, a checkpoint made, and the process
+    ends with a message how to go on: ``SystemExit`` with status 143, or ``KeyboardInterrupt``. A second signal gets through
+    at once, for an environment may hang. A checkpoint that can't be written, on a full disk for example, is a warning:
+    training goes on, and the checkpoint before stays.
+
+    :param directory: of the checkpoints
+    :param every: environment steps between two of them
+    :param keep: how many of the latest ones stay
+    :param notes: called for each one, makes what is to be kept with it, see ``save_checkpoint``
+    :param on_signals: whether to act on SIGTERM and Ctrl-C; only the main thread can
+    :raises ValueError: if ``every`` or ``keep`` is not positive
+    """
+
+    model: ResumableAlgorithm
+
+    def __init__(
+        self,
+        directory: str | Path,
+        every: int,
+        keep: int = 2,
+        notes: Callable[[], Any] | None = None,
+        on_signals: bool = True,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        for name, value in {"every": every, "keep": keep}.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}.")
+        self.directory = Path(directory)
+        self.every = every
+        self.keep = keep
+        self.notes = notes
+        self.on_signals = on_signals
+        self._caught: int | None = None
+        self._handlers: dict[int, Any] = {}
+        self._next = 0
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, ResumableAlgorithm):
+            raise TypeError(f"{type(self.model).__name__} has no save_checkpoint(): use SB3's CheckpointCallback.")
+
+    def _on_training_start(self) -> None:
+        self._next = self.model.num_timesteps + self.every
+        self._caught = None
+        if self.on_signals and threading.current_thread() is threading.main_thread():
+            self._handlers = {number: signal.signal(number, self._catch) for number in _SIGNALS}
+            self.model.learn_scope.callback(self._release_signals)  # after an error as well
+            self.model.learn_scope.push(self._save_after_all)
+
+    def _catch(self, number: int, frame: FrameType | None) -> None:
+        if self._caught is not None:
+            self._caught = None
+            self._release_signals()
+            signal.raise_signal(number)
+            return
+        self._caught = number
+        name = signal.Signals(number).name
+        warnings.warn(
+            f"{name}: the step is finished and a checkpoint made. A second one ends the process at once.", stacklevel=2
+        )
+
+    def _save_after_all(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
+        """Ctrl-C in a terminal reaches the environments' processes as well, which end, so that the step can't be finished."""
+        if isinstance(error, EnvironmentFailedError) and self._caught is not None:
+            self._end_process(self._caught)
+
+    def _on_rollout_start(self) -> None:
+        if self._caught is not None:
+            self._end_process(self._caught)
+        if self.model.num_timesteps >= self._next:
+            self._next = self.model.num_timesteps + self.every
+            self._save()
+
+    def _save(self) -> bool:
+        try:
+            self.model.save_checkpoint(self.directory, self.keep, None if self.notes is None else self.notes())
+        except OSError as error:
+            warnings.warn(
+                f"The checkpoint after {self.model.num_timesteps} steps could not be written to {self.directory}: "
+                f"{as_sentence(error)} Training goes on, and the checkpoint before it is as it was.",
+                stacklevel=2,
+            )
+            return False
+        return True
+
+    def _end_process(self, number: int) -> None:
+        saved = f"after {self.model.num_timesteps} steps" if self._save() else "before the last one failed"
+        message = (
+            f"Stopped by {signal.Signals(number).name}; the checkpoint {saved} is in {self.directory}. To go on: model = "
+            f'{type(self.model).__name__}.resume("{self.directory}", env), then '
+            "model.learn(model.steps_left, reset_num_timesteps=False)."
+        )
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt(message)
+        warnings.warn(message, stacklevel=2)
+        raise SystemExit(128 + number)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _release_signals(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers = {}

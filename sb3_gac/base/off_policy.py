@@ -1,0 +1,415 @@
+"""What off-policy algorithms with a privileged view share: arguments, their checks, acting and save lists."""
+
+from collections import deque
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from typing_extensions import Self
+
+from sb3_gac.base.overrides import algorithm_of
+from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
+from sb3_gac.base.resuming import ResumableAlgorithm
+from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_role_keys
+from sb3_gac.base.strict_predict import DeploymentGuard
+from sb3_gac.checks.arguments import (
+    KEPT_AS,
+    PlainSchedule,
+    check_shared_arguments,
+    check_what_construction_needs,
+    make_arguments_plain,
+)
+from sb3_gac.checks.entries import check_held_by
+from sb3_gac.checks.requirements import check_goals, check_rewards_of_goals
+from sb3_gac.checks.values import plain
+from sb3_gac.networks.heads import check_action_space, resolve_target_entropy
+from sb3_gac.optim.coefficients import Coefficient, DualVariable, make_coefficient
+from sb3_gac.optim.parallel import has_side_effects
+from sb3_gac.replay.buffer import CompactDictReplayBuffer
+from sb3_gac.replay.episodes import EpisodeReplayBuffer, check_learns_from_sequences
+
+ENT_COEF_START = 0.1
+ENT_COEF_BOUNDS = (1e-8, 1e4)
+#: Options of our replay buffers that say how to sample, not what is stored
+SAMPLING_OPTIONS = ("n_steps", "gamma", "sequence_length", "burn_in")
+
+
+class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
+    """
+    Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
+
+    A subclass names its policy class in ``policy_aliases`` and writes one gradient step.
+
+    The arguments up to ``target_entropy``, and from ``stats_window_size`` on, are those of SB3's SAC.
+
+    :param policy: "MultiInputPolicy", or a subclass of the policy class of that name
+    :param env: environment with Dict observations and Box actions
+    :param learning_rate: of policies, critics and the entropy temperature; a number or a schedule
+    :param buffer_size: transitions kept
+    :param learning_starts: steps of uniform warm-up
+    :param batch_size: transitions per gradient step
+    :param tau: Polyak coefficient of the target critics
+    :param gamma: discount factor
+    :param train_freq: steps, or (n, "step" | "episode"), between two rounds of training
+    :param gradient_steps: gradient steps per round; -1 for as many as there were environment steps
+    :param action_noise: added to the behaviour policy's actions
+    :param replay_buffer_class: default :class:`CompactDictReplayBuffer`, which stores each observation once
+    :param replay_buffer_kwargs: keyword arguments for it
+    :param optimize_memory_usage: of other replay buffers, see SB3
+    :param n_steps: rewards summed up in a critic's target before it bootstraps
+    :param ent_coef: entropy temperature: "auto", "auto_<start value>" or a number
+    :param target_update_interval: gradient steps between two updates of the targets
+    :param target_entropy: in nats: "auto", "sac" or a number, see :func:`sb3_gac.networks.heads.resolve_target_entropy`
+    :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
+    :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
+    :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
+        "critic" stands for all critics: where ``privileged`` is the whole state, spare them the sensor noise with
+        ``{"critic": ["privileged"]}``
+    :param compile: compile losses and gradients: half a minute at the start (less the next time, from a cache), faster
+        gradient steps from then on; needs a C++ compiler on the CPU
+    :param mixed_precision: matrix products of losses and gradients in bfloat16, which pays at 256 units and more on
+        hardware that has it, with ``compile``
+    :param stats_window_size: episodes averaged in rollout statistics
+    :param tensorboard_log: log directory, ``None`` for no log
+    :param policy_kwargs: keyword arguments of the policy class
+    :param verbose: 0 silent, 1 information, 2 debug
+    :param seed: of the pseudo-random generators
+    :param device: "auto", "cpu", "cuda", ...
+    :param _init_setup_model: build the networks at construction
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
+    #: Arguments that files hold results of: given to ``load`` or ``resume``, they count once those are restored
+    restored_arguments: ClassVar[tuple[str, ...]] = ("ent_coef", "lr_scales", "stats_window_size")
+    policy_class: type[AsymmetricPolicy]
+    policy: AsymmetricPolicy
+
+    def __init__(
+        self,
+        policy: str | type[AsymmetricPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        max_grad_norm: float | None = 1.0,
+        lr_scales: Mapping[str, float] | None = None,
+        role_keys: RoleKeys | None = None,
+        compile: bool = False,
+        mixed_precision: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        check_what_construction_needs(device, verbose)
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class,
+            replay_buffer_kwargs,
+            optimize_memory_usage,
+            n_steps,
+            policy_kwargs,
+            stats_window_size,
+            tensorboard_log,
+            verbose,
+            device,
+            support_multi_env=True,
+            seed=seed,
+            sde_support=False,
+        )
+        self.ent_coef = ent_coef
+        self.target_entropy = target_entropy
+        self.target_update_interval = target_update_interval
+        self.max_grad_norm = max_grad_norm
+        self.lr_scales = lr_scales
+        self.role_keys = role_keys
+        self.compile = compile
+        self.mixed_precision = mixed_precision
+        if _init_setup_model:
+            self._setup_model()
+
+    # --- set-up -----------------------------------------------------------------------------------------------------
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(
+                f'policy must be one of {list(self.policy_aliases)} or a policy class, got "{policy_name}": '
+                f'{type(self).__name__} works on Dict observations, for which SB3\'s name is "MultiInputPolicy".'
+            )
+        return self.policy_aliases[policy_name]
+
+    def _setup_lr_schedule(self) -> None:
+        self.lr_schedule = PlainSchedule(self.learning_rate)
+
+    def _setup_model(self) -> None:
+        make_arguments_plain(self)
+        self._check_arguments()
+        self.algorithm = algorithm_of(type(self))  # so that a file says whose it is
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = CompactDictReplayBuffer if self.policy_class.cell is None else EpisodeReplayBuffer
+        self._fit_action_noise()
+        if self.replay_buffer is None and self.env is not None:  # to act takes no memory for training
+            self.replay_buffer = self._make_replay_buffer()
+        as_given = {name: getattr(self, name) for name in ("policy_kwargs", "n_steps", "replay_buffer")}
+        self.policy_kwargs = self._all_policy_kwargs()
+        if issubclass(self.replay_buffer_class, CompactDictReplayBuffer):
+            self.n_steps = 1  # SB3 warns that it can't pass n_steps on to this buffer: it was
+        if self.replay_buffer is None:
+            self.replay_buffer = object()  # type: ignore[assignment]  # SB3 would make one
+        try:
+            super()._setup_model()
+        finally:
+            self.__dict__.update(as_given)  # saved as the user gave them
+        self._halves_are_independent = (
+            self.device.type == "cpu" and self.policy.halves_are_independent and not has_side_effects(self.policy)
+        )
+        if self.compile and has_side_effects(self.policy):
+            raise ValueError("compile=True can't do dropout or batch normalisation: leave them out, or leave it False.")
+        self._setup_coefficients()
+        self.programs = {}
+        self._behaviour_state: BehaviourState = None
+        if self.env is not None:
+            _ = self.replay_source  # which may refuse, or warn
+
+    def _check_arguments(self) -> None:
+        """
+        :raises ValueError: naming the argument and the remedy
+        """
+        if not (isinstance(self.policy_class, type) and issubclass(self.policy_class, AsymmetricPolicy)):
+            names = list(self.policy_aliases)
+            raise ValueError(f"policy must be one of {names} or a subclass of their classes, got {self.policy_class!r}.")
+        if not hasattr(self, "observation_space"):
+            raise ValueError("env must be an environment, got None: load() alone can do without.")
+        check_action_space(type(self).__name__, self.action_space)
+        check_shared_arguments(self)
+        resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
+        assert isinstance(self.observation_space, spaces.Dict)
+        check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
+        check_goals(self.replay_buffer_class, self.observation_space, self.env)
+        resolve_lr_scales(self.policy_class.roles, self.lr_scales)
+        if self.policy_class.cell is not None:
+            check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
+        self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
+
+    def _make_replay_buffer(self) -> ReplayBuffer:
+        assert self.replay_buffer_class is not None
+        options = self._replay_buffer_options()
+        if issubclass(self.replay_buffer_class, HerReplayBuffer):
+            options["env"] = self.env
+        return self.replay_buffer_class(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            optimize_memory_usage=self.optimize_memory_usage,
+            **options,
+        )
+
+    def _replay_buffer_options(self) -> dict[str, Any]:
+        """Arguments of the replay buffer's class, those that are arguments of the algorithm included."""
+        assert self.replay_buffer_class is not None
+        ours = issubclass(self.replay_buffer_class, CompactDictReplayBuffer)
+        return {**({"n_steps": self.n_steps, "gamma": self.gamma} if ours else {}), **self.replay_buffer_kwargs}
+
+    def _fit_action_noise(self) -> None:
+        """Noise that SB3 has made for another number of environments becomes noise for as many as there are."""
+        noise = self.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:
+            base = deepcopy(noise.base_noise)
+            base.reset()
+            self.action_noise = VectorizedActionNoise(base, self.n_envs) if self.n_envs > 1 else base
+
+    def _all_policy_kwargs(self) -> dict[str, Any]:
+        return {**self._policy_options(), **self.policy_kwargs}
+
+    def _policy_options(self) -> dict[str, Any]:
+        """Arguments of the policy class that are arguments of the algorithm."""
+        return {"role_keys": self.role_keys, "lr_scales": self.lr_scales}
+
+    def _setup_coefficients(self) -> None:
+        self.ent_coef_dual: Coefficient = make_coefficient(
+            "ent_coef", self.ent_coef, ENT_COEF_START, ENT_COEF_BOUNDS, self.lr_schedule(1), self.device
+        )
+
+    # --- SB3's names ------------------------------------------------------------------------------------------------
+
+    @property
+    def actor(self) -> th.nn.Module:  # type: ignore[override]
+        """The deployed policy; called, it returns actions."""
+        return self.policy.actor  # type: ignore[return-value]
+
+    @property
+    def critic(self) -> th.nn.Module:
+        """The critics that the deployed policy climbs."""
+        return self.policy.critic  # type: ignore[return-value]
+
+    @property
+    def critic_target(self) -> th.nn.Module:
+        """Target of :attr:`critic`."""
+        return self.policy.critic_target  # type: ignore[return-value]
+
+    @property
+    def log_ent_coef(self) -> th.Tensor | None:
+        """Logarithm of a learned entropy temperature; ``None`` if it is fixed."""
+        return self.ent_coef_dual.log_value if isinstance(self.ent_coef_dual, DualVariable) else None
+
+    @property
+    def ent_coef_tensor(self) -> th.Tensor:
+        """The entropy temperature."""
+        return self.ent_coef_dual.value
+
+    @property
+    def ent_coef_optimizer(self) -> th.optim.Optimizer | None:
+        """Optimiser of a learned entropy temperature."""
+        return self.ent_coef_dual.optimizer
+
+    def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
+        """Optimisers that follow ``learning_rate``."""
+        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.flat_parameters]
+        return optimizers if self.ent_coef_optimizer is None else [*optimizers, self.ent_coef_optimizer]
+
+    # --- acting -----------------------------------------------------------------------------------------------------
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Uniform during warm-up, then the behaviour policy, which sees everything.
+
+        :param learning_starts: steps of warm-up
+        :param action_noise: added to the scaled action, which is then clipped
+        :param n_envs: number of environments
+        :return: action for the environments, and the same scaled to [-1, 1] for the buffer
+        """
+        warms_up = self.num_timesteps < learning_starts
+        if warms_up and self.policy.cell is None:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        assert isinstance(self._last_obs, dict)
+        scaled_action, self._behaviour_state = self.policy.behaviour_action(
+            self._last_obs, self._behaviour_state, self._last_episode_starts
+        )
+        if warms_up:  # the memory was brought up
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        if action_noise is not None:
+            scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
+        return self._in_environments_range(scaled_action), scaled_action
+
+    def _in_environments_range(self, action: np.ndarray) -> np.ndarray:
+        """
+        :param action: in [-1, 1], or one of a number
+        """
+        return self.policy.unscale_action(action) if isinstance(self.action_space, spaces.Box) else action
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        assert self.env is not None
+        check_rewards_of_goals(self.replay_buffer_class, self.replay_buffer_kwargs, self.env)
+        return result
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """See SB3's ``OffPolicyAlgorithm.learn``; TensorBoard's runs are named after the class by default."""
+        tb_log_name = tb_log_name or type(self).__name__
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    # --- save and load ----------------------------------------------------------------------------------------------
+
+    def get_parameters(self) -> dict[str, dict]:
+        """See SB3's ``get_parameters``: optimisers' options are Python's numbers, whatever a schedule or a callback left."""
+        self.policy.refresh_parameters()
+        parameters = super().get_parameters()
+        for name, state in parameters.items():
+            if "optim" in name:
+                state["param_groups"] = plain(state["param_groups"], arrays=True)
+        return parameters
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """See SB3's ``load_replay_buffer``; how the buffer is sampled is the model's to say, not the file's."""
+        super().load_replay_buffer(path, truncate_last_traj)
+        if isinstance(self.replay_buffer, CompactDictReplayBuffer):
+            options = self._replay_buffer_options()
+            given = {name: options[name] for name in SAMPLING_OPTIONS if name in options and hasattr(self.replay_buffer, name)}
+            vars(self.replay_buffer).update(given)
+
+    def _change_arguments(self, given: dict[str, Any]) -> None:
+        """
+        :param given: some of ``restored_arguments``; they take the place of what was restored. A coefficient that is learned
+            before and after goes on from where it was, unless it is given a start value
+        """
+        if not given:
+            return
+        before = {name: (getattr(self, name.removesuffix("_dual")), getattr(self, name)) for name in self._dual_names()}
+        vars(self).update({KEPT_AS.get(name, name): value for name, value in given.items()})
+        make_arguments_plain(self)
+        self._check_arguments()
+        self._setup_coefficients()
+        for name, (spec, coefficient) in before.items():
+            argument = name.removesuffix("_dual")
+            spec_now = getattr(self, argument)
+            if not any(other.startswith(argument) for other in given):
+                setattr(self, name, coefficient)
+            elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, DualVariable)):
+                getattr(self, name).go_on_from(coefficient)
+        if "lr_scales" in given:
+            self.policy.scale_learning_rates(self._all_policy_kwargs()["lr_scales"])
+        for buffer in ("ep_info_buffer", "ep_success_buffer"):
+            if getattr(self, buffer) is not None:
+                setattr(self, buffer, deque(getattr(self, buffer), maxlen=self._stats_window_size))
+
+    def _dual_names(self) -> list[str]:
+        """Attributes that hold coefficients."""
+        return ["ent_coef_dual"]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *self._dual_names(), "programs", "program_key"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", *(f"policy.{name}.optimizer" for name in self.policy.flat_parameters)]
+        tensors = []
+        for dual in self._dual_names():
+            dual_state_dicts, dual_tensors = getattr(self, dual).state_names
+            state_dicts += [f"{dual}.{name}" for name in dual_state_dicts]
+            tensors += [f"{dual}.{name}" for name in dual_tensors]
+        return state_dicts, tensors

@@ -1,0 +1,365 @@
+"""Checkpoints of all that training depends on, from which another process goes on as if there had been no interruption."""
+
+import io
+import json
+import random
+import warnings
+from collections.abc import Mapping
+from contextlib import ExitStack
+from copy import deepcopy
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
+from typing_extensions import Self
+
+from sb3_gac.base.faults import networks_named
+from sb3_gac.base.overrides import SETTINGS, check_names, check_unchanged
+from sb3_gac.base.update import NetworkTraining
+from sb3_gac.checkpoint.files import (
+    CheckpointError,
+    checksum,
+    has_block,
+    latest_whole,
+    read_block,
+    write_block,
+    write_checkpoint,
+)
+from sb3_gac.checkpoint.serialization import UntrustedNameError, decode, encode
+from sb3_gac.checkpoint.vec_env import restore_vec_env_state, vec_env_state
+from sb3_gac.checks.arguments import KEPT_AS, constructor_arguments
+from sb3_gac.replay.buffer import CompactDictReplayBuffer
+
+BLOCK_BYTES = 4 << 20
+#: Attributes of the algorithm that training changes, besides networks, coefficients and the replay buffer
+PROGRESS = (
+    "num_timesteps",
+    "_total_timesteps",
+    "_num_timesteps_at_start",
+    "_episode_num",
+    "_rollout_steps",
+    "_rollout_episodes",
+    "_n_updates",
+    "_last_metrics",
+    "_current_progress_remaining",
+    "_last_obs",
+    "_last_original_obs",
+    "_last_episode_starts",
+    "_behaviour_state",
+    "ep_info_buffer",
+    "ep_success_buffer",
+    "strict_deployment",
+    "trained_normalised",
+)
+#: Arguments that what a checkpoint holds was made with
+FIXED = ("policy", "policy_kwargs", "buffer_size", "replay_buffer_class")
+_STATE, _ARRAYS, _TENSORS = "state.json", "arrays.npz", "tensors.pt"
+
+
+class SavedBlocks(NamedTuple):
+    """
+    What a replay buffer's rows were when they were last written.
+
+    :param root: of the checkpoints
+    :param n_added: transitions added by then, per environment
+    :param names: of the blocks, in the order of the rows
+    """
+
+    root: Path
+    n_added: int
+    names: list[str]
+
+
+class ResumableAlgorithm(NetworkTraining):
+    """
+    Adds :meth:`save_checkpoint` and :meth:`resume` to an off-policy algorithm.
+
+    Files hold JSON, plain arrays and tensors: loading them executes nothing.
+    """
+
+    _saved_blocks: SavedBlocks | None = None
+    _resumed_noise: Any = None
+    #: What :meth:`save_checkpoint` was given to keep, after :meth:`resume`
+    resumed_notes: Any = None
+
+    #: What is to be called when ``learn`` ends, in whatever way
+    learn_scope: ExitStack
+
+    @property
+    def steps_left(self) -> int:
+        """Environment steps of the last ``learn`` that are still to come: what to pass to the next one after a resume."""
+        return max(self._total_timesteps - self.num_timesteps, 0)
+
+    # --- saving -----------------------------------------------------------------------------------------------------
+
+    def save_checkpoint(self, directory: str | Path, keep: int = 2, notes: Any = None) -> Path:
+        """
+        Write down all that training depends on, where another process finds it with :meth:`resume`.
+
+        To be called between two rounds of training: after ``learn``, or by a callback when a rollout starts, as
+        :class:`sb3_gac.ExactCheckpointCallback` does. Of the replay buffer only what has changed is written.
+
+        :param directory: of all checkpoints of this run
+        :param keep: how many of the latest ones stay
+        :param notes: of the caller's, anything that JSON can hold, see :attr:`resumed_notes`
+        :return: directory of this checkpoint
+        :raises OSError: if it can't be written; the checkpoints before it are as they were
+        :raises TypeError: if the replay buffer is of another class than this package's
+        """
+        buffer = self.replay_buffer
+        if buffer is None:
+            raise TypeError("There is no replay buffer to write down: set_env() gives one to a model that was loaded without.")
+        if not isinstance(buffer, CompactDictReplayBuffer):
+            raise TypeError(
+                f"A checkpoint can hold a CompactDictReplayBuffer or a subclass, but replay_buffer_class is "
+                f"{type(buffer).__name__}: leave it out, or use save() and save_replay_buffer()."
+            )
+        root = Path(directory).absolute()
+        saved = self._write_rows(buffer, root)
+        arrays: dict[str, np.ndarray] = {}
+        state = {
+            "algorithm": _qualified_name(type(self)),
+            "arguments": self._encoded_arguments(arrays),
+            "spaces": _describe_spaces(self.observation_space, self.action_space),
+            "n_envs": self.n_envs,
+            "progress": encode({name: getattr(self, name) for name in PROGRESS}, arrays),
+            "generators": encode(self._generator_states(), arrays),
+            "env": encode(None if self.env is None else vec_env_state(self.env), arrays),
+            "buffer": encode(buffer.bookkeeping() | {"blocks": saved.names}, arrays),
+            "notes": notes,
+        }
+        files = {
+            _STATE: json.dumps(state).encode(),
+            _ARRAYS: _in_memory(lambda file: np.savez(file, **arrays)),  # type: ignore[arg-type]
+            _TENSORS: _in_memory(lambda file: th.save(self._tensors(), file)),
+        }
+        path = write_checkpoint(root, self.num_timesteps, files, saved.names, keep)
+        self._saved_blocks = saved
+        return path
+
+    def _write_rows(self, buffer: CompactDictReplayBuffer, root: Path) -> SavedBlocks:
+        """Blocks of rows that have changed since they were last written there."""
+        arrays, n_rows = buffer.rows_by_name(), buffer.n_rows
+        per_block = _rows_per_block(arrays)
+        n_filled = min(buffer.n_added + 1, n_rows)
+        names = [""] * -(-n_filled // per_block)
+        changed = np.arange(len(names))
+        before = self._saved_blocks
+        if before is not None and before.root == root and buffer.n_added - before.n_added < n_rows - 2:
+            names[: len(before.names)] = before.names
+            # The step before may have been cut, and the newest next observation stands where a step to come will be
+            written = np.arange(max(before.n_added - 1, 0), buffer.n_added + 1) % n_rows // per_block
+            changed = np.union1d(written, [block for block, name in enumerate(names) if not has_block(root, name)])
+        for block in changed.astype(int).tolist():
+            rows = slice(block * per_block, min((block + 1) * per_block, n_filled))
+            names[block] = write_block(root, b"".join(array[rows].tobytes() for array in arrays.values()))
+        return SavedBlocks(root, buffer.n_added, names)
+
+    def _encoded_arguments(self, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+        """Of the constructor, as far as they can be written down; of the others, what can't be."""
+        arguments: dict[str, Any] = {}
+        for name in constructor_arguments(type(self)):
+            try:
+                value = getattr(self, KEPT_AS.get(name, name))
+                if isinstance(value, TrainFreq):
+                    value = (value.frequency, value.unit.value)
+                arguments[name] = {"value": encode(value, arrays)}
+            except (UntrustedNameError, AttributeError, TypeError) as error:
+                arguments[name] = {"cannot": str(error)}
+        return arguments
+
+    def _generator_states(self) -> dict[str, Any]:
+        return {
+            "torch": th.get_rng_state().numpy(),
+            "cuda": [state.numpy() for state in th.cuda.get_rng_state_all()] if th.cuda.is_available() else [],
+            "numpy": np.random.get_state(),
+            "python": random.getstate(),
+            "action_space": self.action_space.np_random,
+        }
+
+    def _tensors(self) -> dict[str, Any]:
+        """State of networks, optimisers and coefficients."""
+        _, names = self._get_torch_save_params()
+        free = {name: recursive_getattr(self, name).detach() for name in names}
+        return {"parameters": self.get_parameters(), "free": free}
+
+    # --- resuming ---------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def resume(cls, directory: str | Path, env: GymEnv, device: th.device | str = "auto", **given: Any) -> Self:
+        """
+        Go on from the latest checkpoint that is whole; a later one that is incomplete or altered is named in a warning.
+
+        The next ``learn(model.steps_left, reset_num_timesteps=False)`` does what the interrupted one would have done, to
+        the bit where the environments can be put back to where they were; where they can't, a warning says why, and new
+        episodes start.
+
+        :param directory: of :meth:`save_checkpoint`
+        :param env: made like the one before
+        :param device: may be another one
+        :param given: arguments of the constructor, which take the place of those before, and ``strict_deployment``; needed
+            are those that no file can hold, such as functions and classes of your own
+        :return: the model as it was
+        :raises CheckpointError: if no checkpoint is whole, or it is of another algorithm
+        :raises TypeError: naming what is no argument
+        :raises ValueError: naming a needed argument, one that can't be changed, or the entry of a space that is another one
+            now
+        """
+        root = Path(directory).absolute()
+        path, files = latest_whole(root)
+        state = json.loads(files[_STATE])
+        if state["algorithm"] != _qualified_name(cls):
+            raise CheckpointError(f"{path} is of {state['algorithm']}: resume it with that class, not {cls.__name__}.")
+        with np.load(io.BytesIO(files[_ARRAYS]), allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        check_names(cls, given, "resume()")
+        settings = {name: given.pop(name) for name in SETTINGS if name in given}
+        later = {name: given.pop(name) for name in cls.restored_arguments if name in given}
+        before = _decoded_arguments(state["arguments"], given, arrays)
+        model = cls(env=env, device=device, **before | given)
+        model._check_same_spaces(state)
+        model._check_fixed_arguments(given, before)
+        tensors = th.load(io.BytesIO(files[_TENSORS]), map_location=model.device, weights_only=True)
+        with networks_named(path, list(given)):
+            model._restore(
+                root, tensors, {name: decode(state[name], arrays) for name in ("progress", "generators", "env", "buffer")}
+            )
+        if model.seed is not None and model.seed != before.get("seed"):
+            model.set_random_seed(model.seed)
+        vars(model).update(settings)
+        model._change_arguments(later)
+        model.resumed_notes = state["notes"]
+        return model
+
+    def _check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
+        """Of those that were given: that they are what the checkpoint's networks and buffer were made with."""
+        for name in FIXED:
+            if name in given and name in before:
+                check_unchanged(name, getattr(self, KEPT_AS.get(name, name)), before[name], "resume()")
+        if "replay_buffer_kwargs" in given and "replay_buffer_kwargs" in before:
+            now, then = ((arguments["replay_buffer_kwargs"] or {}).get("storage_dtype") for arguments in (given, before))
+            check_unchanged("replay_buffer_kwargs' storage_dtype", now, then, "resume()")
+
+    def _check_same_spaces(self, state: dict[str, Any]) -> None:
+        now = _describe_spaces(self.observation_space, self.action_space)
+        for name in sorted({*now, *state["spaces"]}):
+            before, after = state["spaces"].get(name, "missing"), now.get(name, "missing")
+            if before != after:
+                raise ValueError(f"env differs from the checkpoint's in {name}: it is {after}, and was {before}.")
+        if state["n_envs"] != self.n_envs:
+            raise ValueError(f"env must be {state['n_envs']} environments, as before, but it is {self.n_envs}.")
+
+    def _restore(self, root: Path, tensors: dict[str, Any], state: dict[str, Any]) -> None:
+        self.set_parameters(tensors["parameters"], exact_match=True, device=self.device)
+        self.policy.freeze_as_saved()
+        for name, value in tensors["free"].items():
+            recursive_setattr(self, f"{name}.data", value.data)
+        for name, value in state["progress"].items():
+            setattr(self, name, value)
+        self._resumed_noise = self.action_noise
+        self._read_rows(root, state["buffer"])
+        self._restore_env(state["env"], state["generators"])
+        self._restore_generators(state["generators"])
+
+    def _read_rows(self, root: Path, bookkeeping: dict[str, Any]) -> None:
+        buffer = self.replay_buffer
+        assert isinstance(buffer, CompactDictReplayBuffer)
+        names = bookkeeping.pop("blocks")
+        buffer.restore_bookkeeping(bookkeeping)
+        arrays = buffer.rows_by_name()
+        per_block, n_filled = _rows_per_block(arrays), min(buffer.n_added + 1, buffer.n_rows)
+        for block, name in enumerate(names):
+            content, start = memoryview(read_block(root, name)), 0
+            rows = slice(block * per_block, min((block + 1) * per_block, n_filled))
+            for array in arrays.values():
+                part = array[rows]
+                part[...] = np.frombuffer(content[start : start + part.nbytes], dtype=array.dtype).reshape(part.shape)
+                start += part.nbytes
+        self._saved_blocks = SavedBlocks(root, buffer.n_added, names)
+
+    def _restore_env(self, state: dict[str, Any] | None, generators: dict[str, Any]) -> None:
+        assert self.env is not None
+        why = "there was none" if state is None else restore_vec_env_state(self.env, state)
+        if why:
+            warnings.warn(f"New episodes start, since those of the checkpoint can't be gone on with: {why}.", stacklevel=4)
+            self._last_obs = None
+            self.env.seed(int(generators["numpy"][1][0]) % 2**31)  # the same for the same checkpoint
+        self._note_use()
+
+    def _restore_generators(self, states: dict[str, Any]) -> None:
+        """Last: whatever else is restored may draw random numbers."""
+        th.set_rng_state(th.from_numpy(states["torch"]))
+        if th.cuda.is_available() and len(states["cuda"]) == th.cuda.device_count():
+            th.cuda.set_rng_state_all([th.from_numpy(state) for state in states["cuda"]])
+        np.random.set_state(states["numpy"])
+        random.setstate(states["python"])
+        self.action_space._np_random = states["action_space"]
+
+    def learn(self, *args: Any, **kwargs: Any) -> Self:
+        """See SB3's ``learn``."""
+        with ExitStack() as self.learn_scope:
+            return super().learn(*args, **kwargs)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, Any]:
+        """SB3 resets the action noise at each ``learn``, but a resumed one goes on."""
+        noise, self._resumed_noise = deepcopy(self._resumed_noise), None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if noise is not None and not reset_num_timesteps:
+            self.action_noise = noise
+        return result
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_saved_blocks", "_resumed_noise", "resumed_notes", "learn_scope"]
+
+
+def _qualified_name(algorithm: type) -> str:
+    return f"{algorithm.__module__}.{algorithm.__qualname__}"
+
+
+def _rows_per_block(arrays: Mapping[str, np.ndarray]) -> int:
+    return max(1, BLOCK_BYTES // sum(array[0].nbytes for array in arrays.values()))
+
+
+def _in_memory(write: Any) -> bytes:
+    """
+    :param write: to a file
+    :return: what it wrote
+    """
+    file = io.BytesIO()
+    write(file)
+    return file.getvalue()
+
+
+def _decoded_arguments(stored: dict[str, Any], given: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Those that the checkpoint holds; the others must have been given."""
+    missing = {name: entry["cannot"] for name, entry in stored.items() if "cannot" in entry and name not in given}
+    if missing:
+        reasons = "; ".join(f"{name} ({reason})" for name, reason in missing.items())
+        raise ValueError(f"No checkpoint can hold these arguments, pass them to resume() as before: {reasons}.")
+    return {name: decode(entry["value"], arrays) for name, entry in stored.items() if "cannot" not in entry}
+
+
+def _describe_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> dict[str, str]:
+    """Name -> description that is the same if and only if shape, type and bounds are."""
+    assert isinstance(observation_space, spaces.Dict)
+    entries = {f'the observation\'s entry "{key}"': space for key, space in observation_space.items()}
+    return {name: _describe(space) for name, space in {**entries, "the actions": action_space}.items()}
+
+
+def _describe(space: spaces.Space) -> str:
+    if not isinstance(space, spaces.Box):
+        return str(space)
+    low, high = (np.array2string(bound, threshold=8) for bound in (space.low, space.high))
+    all_bounds = checksum(space.low.tobytes() + space.high.tobytes())[:8]  # a long array is shown by its ends
+    return f"Box of shape {space.shape}, {space.dtype}, within [{low}, {high}] ({all_bounds})".replace("\n", " ")

@@ -1,0 +1,155 @@
+"""Which observation entries each role reads: resolved and checked once, when a model is set up."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, TypeVar
+
+from gymnasium import spaces
+
+from sb3_gac.checks.entries import check_entries
+from sb3_gac.checks.values import check_integer, check_positive
+from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
+
+CRITICS = "critic"
+DEFAULT_NET_ARCH = (256, 256)
+T = TypeVar("T")
+
+RoleKeys = Mapping[str, Sequence[str]]
+
+
+class Roles(NamedTuple):
+    """
+    The networks of an algorithm.
+
+    :param deployed: the policy that acts without privileged entries
+    :param others: the rest; names of critics end in "critic"
+    """
+
+    deployed: str
+    others: tuple[str, ...]
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """Every role, the deployed one first."""
+        return (self.deployed, *self.others)
+
+    @property
+    def critics(self) -> list[str]:
+        """Those that value actions."""
+        return [role for role in self.others if role.endswith(CRITICS)]
+
+    @property
+    def policies(self) -> list[str]:
+        """Those that act."""
+        return [role for role in self.all if role not in self.critics]
+
+    @property
+    def names(self) -> list[str]:
+        """What a user may call them: every role, and "critic" for all critics."""
+        return list(dict.fromkeys([*self.all, CRITICS]))
+
+
+def check_observation_space(observation_space: spaces.Space) -> spaces.Dict:
+    """
+    :raises ValueError: unless the space is a ``Dict`` of entries that can be learned from
+    """
+    if not isinstance(observation_space, spaces.Dict):
+        raise ValueError(
+            f'The observation space must be a Dict with an entry "{PARTIAL}" for the learner and others, such as '
+            f'"{PRIVILEGED}", for the guider, but the environment has {observation_space}. Wrap the environment in '
+            "sb3_gac.envs.SplitObservation, or make one of the registered sb3_gac/* environments."
+        )
+    check_entries(observation_space)
+    return observation_space
+
+
+def resolve_role_keys(
+    observation_space: spaces.Space, roles: Roles, role_keys: RoleKeys | None = None
+) -> dict[str, tuple[str, ...]]:
+    """
+    Complete and check the mapping from roles to observation entries.
+
+    By default the deployed policy reads ``partial`` alone and every other role reads every entry: a guider must see
+    what its learner sees, noise included, or it cannot stay close to it.
+
+    :param observation_space: of the environment
+    :param roles: of the algorithm
+    :param role_keys: role, or "critic" for all critics -> entries, where they differ from the default
+    :return: role -> entries, for all roles
+    :raises ValueError: if a role or an entry is unknown, an entry list is empty, or there is no ``partial`` entry
+        for the deployed policy
+    """
+    entries = tuple(check_observation_space(observation_space).spaces)
+    role_keys = role_keys or {}
+    unknown_roles = sorted(set(role_keys) - {*roles.all, CRITICS})
+    if unknown_roles:
+        raise ValueError(f"role_keys names unknown roles {unknown_roles}; the roles are {roles.names}.")
+    if roles.deployed not in role_keys and PARTIAL not in entries:
+        raise ValueError(
+            f'The observation has no entry "{PARTIAL}" (its entries are {list(entries)}). Rename the entry that the '
+            f'{roles.deployed} may see to "{PARTIAL}", or name it with role_keys={{"{roles.deployed}": ["<entry>"]}}.'
+        )
+    resolved = dict.fromkeys(roles.all, entries) | {roles.deployed: (PARTIAL,)}
+    for name, keys in role_keys.items():
+        if isinstance(keys, str) or not keys:
+            raise ValueError(f'role_keys["{name}"] must be a non-empty list of observation entries, got {keys!r}.')
+        unknown_keys = [key for key in keys if key not in entries]
+        if unknown_keys:
+            raise ValueError(
+                f'role_keys["{name}"] names unknown observation entries {unknown_keys}; the observation has {list(entries)}.'
+            )
+    return resolved | {role: tuple(keys) for role, keys in _for_each_role(roles, role_keys).items()}
+
+
+def role_space(observation_space: spaces.Dict, keys: Sequence[str]) -> spaces.Dict:
+    """The part of the observation space that a role reads."""
+    return spaces.Dict({key: observation_space.spaces[key] for key in keys})
+
+
+def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]) -> dict[str, list[int]]:
+    """
+    Hidden layer sizes per role.
+
+    :param roles: of the algorithm
+    :param net_arch: one list for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each policy and one
+        for "critic"
+    :return: role -> sizes, for all roles
+    :raises ValueError: if the names are of neither form, or a size is no integer above 0
+    """
+    policies = roles.policies
+    if isinstance(net_arch, list):
+        net_arch = {**dict.fromkeys(policies, net_arch), "critic": net_arch}
+    if isinstance(net_arch, Mapping) and set(net_arch) == {"pi", "qf"}:
+        net_arch = {**dict.fromkeys(policies, net_arch["pi"]), "critic": net_arch["qf"]}
+    if not isinstance(net_arch, Mapping) or set(net_arch) != {*policies, "critic"}:
+        raise ValueError(
+            f'net_arch must be a list, {{"pi": [...], "qf": [...]}} or one list for each of {[*policies, "critic"]}, '
+            f"got {net_arch!r}."
+        )
+    for sizes in net_arch.values():
+        for size in sizes:
+            check_integer("net_arch: a layer's size", size, 1)
+    return {role: net_arch[role if role in policies else "critic"] for role in roles.all}
+
+
+def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> dict[str, float]:
+    """
+    Learning rates per role.
+
+    :param roles: of the algorithm
+    :param lr_scales: role, or "critic" for all critics -> multiple of the learning rate, where it is not 1
+    :return: role -> multiple, for all roles
+    :raises ValueError: if a role is unknown or a multiple is not a number above 0
+    """
+    lr_scales = dict(lr_scales or {})
+    unknown_roles = sorted(set(lr_scales) - {*roles.all, CRITICS})
+    if unknown_roles:
+        raise ValueError(f"lr_scales names unknown roles {unknown_roles}; the roles are {roles.names}.")
+    for role, scale in lr_scales.items():
+        check_positive(f'lr_scales["{role}"]', scale)
+    return dict.fromkeys(roles.all, 1.0) | _for_each_role(roles, lr_scales)
+
+
+def _for_each_role(roles: Roles, values: Mapping[str, T]) -> dict[str, T]:
+    """What is said of "critic" is said of every critic that is not named itself."""
+    of_critics = {role: values[CRITICS] for role in roles.critics if CRITICS in values}
+    return of_critics | {role: value for role, value in values.items() if role in roles.all}

@@ -1,0 +1,62 @@
+"""The deployment guard: predict refuses what the deployed policy does not read."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_gac.base.policy import AsymmetricPolicy
+
+
+class DeploymentGuard(BaseAlgorithm):
+    """
+    ``predict`` of an algorithm whose deployed policy reads only some of the observation's entries.
+
+    It ignores all others, so that evaluation may pass it full observations.  With ``strict_deployment`` it refuses them::
+
+        model = GAC.load("cheetah", strict_deployment=True)
+
+    The attribute may be set at any time and is saved with the model.  Evaluations during training pass full observations:
+    set it afterwards.
+    """
+
+    policy: AsymmetricPolicy
+    strict_deployment: bool = False
+    #: Whether it learned from observations that ``VecNormalize`` normalised: without these statistics there is no deployment
+    trained_normalised: bool = False
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        self.trained_normalised = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
+        return result
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        The deployed policy's action.
+
+        :param observation: single or batched; a dict, or, where the policy reads one entry, that entry alone
+        :param state: what a recurrent policy's last call returned, ``None`` at the start
+        :param episode_start: true where an episode starts, shape (B,)
+        :param deterministic: mode instead of a sample
+        :return: action in the environment's range, and the state for the next call
+        :raises ValueError: if an entry is missing; with ``strict_deployment``, if there is one that the policy does not read
+        """
+        if self.strict_deployment and isinstance(observation, Mapping):
+            self._refuse_unread(observation)
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def _refuse_unread(self, observation: Mapping[str, np.ndarray]) -> None:
+        reads = self.policy.deployed.observation_space.spaces  # type: ignore[attr-defined]
+        unread = [key for key in observation if key not in reads]
+        if unread:
+            raise ValueError(
+                f"strict_deployment=True: the policy reads {list(reads)}, but the observation passed to predict() also has "
+                f"{unread}. Nothing else belongs where the policy is deployed: leave them out."
+            )

@@ -1,0 +1,110 @@
+"""Training that diverged: found where metrics come to the host anyway, and written down."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_gac.checks.arguments import constructor_parameters
+
+
+class DivergenceError(RuntimeError):
+    """
+    A loss, a gradient norm or another metric is NaN or infinite.
+
+    :param message: which, when, and what to try
+    :param diagnosis: what :func:`diagnose` found
+    :param path: of the file that holds it, ``None`` if there is none
+    """
+
+    def __init__(self, message: str, diagnosis: dict[str, Any] | None = None, path: Path | None = None):
+        super().__init__(message)
+        self.diagnosis = diagnosis or {}
+        self.path = path
+
+
+def check_finite_metrics(
+    model: OffPolicyAlgorithm, metrics: dict[str, float], last_good: Mapping[str, float], coefficients: Mapping[str, th.Tensor]
+) -> None:
+    """
+    :param model: that was trained
+    :param metrics: of the gradient steps just done
+    :param last_good: of the round before them
+    :param coefficients: learned or fixed ones of its losses
+    :raises DivergenceError: if one of the metrics is not finite
+    """
+    not_finite = [name for name, value in metrics.items() if not math.isfinite(value)]
+    if not not_finite:
+        return
+    diagnosis = diagnose(model, metrics, last_good, coefficients)
+    path = write_diagnosis(diagnosis, model.logger.get_dir(), model.num_timesteps)
+    raise DivergenceError(
+        f"Training diverged: after {model.num_timesteps} steps (num_timesteps) and {model._n_updates} gradient steps these "
+        f"metrics are NaN or infinite: {', '.join(not_finite)}. The networks can't be trusted any more: go back to the last "
+        "checkpoint. The last good metrics, coefficients and the largest observations and rewards are in "
+        f"{path or 'the attribute diagnosis of this error'}. Try a lower learning_rate, max_grad_norm=1.0, VecNormalize or "
+        "smaller rewards.",
+        diagnosis,
+        path,
+    )
+
+
+def diagnose(
+    model: OffPolicyAlgorithm, metrics: dict[str, float], last_good: Mapping[str, float], coefficients: Mapping[str, th.Tensor]
+) -> dict[str, Any]:
+    """
+    :param model: that was trained
+    :param metrics: of the gradient steps just done
+    :param last_good: of the round before them
+    :param coefficients: of its losses
+    :return: all of it that JSON can hold, with the largest absolute values in a batch as the networks see it
+    """
+    assert model.replay_buffer is not None
+    samples = model.replay_buffer.sample(model.batch_size, env=model.sampling_env)  # type: ignore[attr-defined]
+    entries: Any = {**samples.observations, "reward": samples.rewards}  # type: ignore[dict-item]
+    diagnosis = {
+        "num_timesteps": model.num_timesteps,
+        "n_updates": model._n_updates,
+        "metrics": metrics,
+        "last_good_metrics": dict(last_good),
+        "coefficients": {name: value.item() for name, value in coefficients.items()},
+        "largest_in_a_batch": {name: values.float().abs().max().item() for name, values in entries.items()},
+        "arguments": _arguments(model),
+    }
+    return json.loads(json.dumps(_without_nan(diagnosis), default=repr))
+
+
+def write_diagnosis(diagnosis: dict[str, Any], directory: str | None, step: int) -> Path | None:
+    """
+    :param diagnosis: of :func:`diagnose`
+    :param directory: of the logger, if it has one
+    :param step: for the file's name
+    :return: of the file; ``None`` if it could not be written, which must not hide why it was to be
+    """
+    if directory is None:
+        return None
+    path = Path(directory) / f"divergence_{step}.json"
+    try:
+        path.write_text(json.dumps(diagnosis, indent=2))
+    except OSError:
+        return None
+    return path
+
+
+def _arguments(model: OffPolicyAlgorithm) -> dict[str, Any]:
+    """What the constructor was given, as far as the model has kept it."""
+    names = [name for name in constructor_parameters(type(model)) if name in vars(model) and name != "env"]
+    return {name: getattr(model, name) for name in names} | {"policy": model.policy_class.__name__}
+
+
+def _without_nan(value: Any) -> Any:
+    """The same for JSON, which has neither NaN nor infinity."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): _without_nan(item) for key, item in value.items()}
+    return [_without_nan(item) for item in value] if isinstance(value, (list, tuple)) else value

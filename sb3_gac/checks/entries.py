@@ -1,0 +1,254 @@
+"""
+Observation entries: the spaces that they may have, the rows that they come in, and the numbers that encoders get.
+
+Whatever depends on an entry's kind (Box, Discrete, MultiDiscrete or MultiBinary) is here, and in what is known of a kind's
+values, :func:`sb3_gac.checks.values.index_bounds`.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space, preprocess_obs
+from stable_baselines3.common.vec_env import VecTransposeImage
+
+from sb3_gac.checks.values import held_by, index_bounds, is_finite
+
+#: Types that torch does little with -> types that hold all of their values, or of uint64 as much as a network sees
+COMPUTABLE = {"uint16": "int32", "uint32": "int64", "uint64": "float64"}
+FLOAT32 = np.dtype(np.float32)
+SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+#: Other kinds of spaces -> what to do instead
+REMEDIES: dict[type[spaces.Space], str] = {
+    spaces.Text: "Encode it as numbers: as Discrete if it is one of several texts, as MultiDiscrete if not.",
+    spaces.Sequence: "Pad it to a Box of its largest length.",
+    spaces.Graph: "Pad nodes and edges to a Box each, of their largest numbers.",
+    spaces.Tuple: "Make each of its parts an entry of the observation.",
+    spaces.Dict: "Make each of its parts an entry of the observation.",
+    spaces.OneOf: "Make each of its choices an entry of the observation, and a Discrete one that says which of them counts.",
+}
+
+
+# --- spaces -------------------------------------------------------------------------------------------------------------
+
+
+def check_entries(space: spaces.Space) -> None:
+    """
+    :param space: of an environment's observations; those that are no Dict are not looked at
+    :raises ValueError: naming the first entry that can't be learned from, and what to do about it
+    """
+    if not isinstance(space, spaces.Dict):
+        return
+    for key, entry in space.spaces.items():
+        if not isinstance(key, str) or not key:
+            raise ValueError(f"The observation has an entry named {key!r}: name it by a string that is not empty.")
+        fault = _unsupported(entry)
+        if fault is not None:
+            raise ValueError(f"The observation's entry \"{key}\" can't be learned from: {fault}")
+
+
+def _unsupported(space: spaces.Space) -> str | None:
+    """What is wrong with the space of an entry, and the remedy; ``None`` if nothing is."""
+    if not isinstance(space, SUPPORTED):
+        remedies = [remedy for kind, remedy in REMEDIES.items() if isinstance(space, kind)]
+        remedy = remedies[0] if remedies else "Make it a Box, Discrete, MultiDiscrete or MultiBinary."
+        return f"its space is {type(space).__name__}. {remedy}"
+    if 0 in space.shape:  # type: ignore[operator]
+        return f"its shape is {space.shape}, so that it holds no number. Leave it out."
+    if np.dtype(space.dtype).itemsize > 8:
+        return f"its type is {space.dtype}, which torch lacks. Make it float64 or float32."
+    return None
+
+
+def check_held_by(buffer_class: type[ReplayBuffer] | None, space: spaces.Dict, own: type[ReplayBuffer]) -> None:
+    """
+    :param buffer_class: ``replay_buffer_class``; ``None`` for one of our own
+    :param space: of the observations
+    :param own: base of those that hold every entry there may be
+    :raises ValueError: naming the entry that SB3's buffers can't hold
+    """
+    if buffer_class is None or issubclass(buffer_class, own):
+        return
+    for key, entry in space.spaces.items():
+        if (entry.shape == () and isinstance(entry, spaces.Box)) or get_obs_shape(entry) != stored_shape(entry):
+            raise ValueError(
+                f"replay_buffer_class={buffer_class.__name__} can't hold the observation's entry \"{key}\" of shape "
+                f"{entry.shape}: leave replay_buffer_class out, or make the entry one-dimensional in the environment."
+            )
+
+
+def stored_shape(space: spaces.Space) -> tuple[int, ...]:
+    """
+    :param space: of an entry
+    :return: the shape that buffers give it
+    """
+    return (1,) if isinstance(space, spaces.Discrete) else space.shape  # type: ignore[return-value]
+
+
+# --- encoding -----------------------------------------------------------------------------------------------------------
+
+
+def encoded_size(space: spaces.Space) -> int:
+    """
+    :param space: of an entry
+    :return: numbers that :func:`encode` makes of it
+    """
+    if isinstance(space, spaces.Discrete):
+        return int(space.n)
+    return int(space.nvec.sum()) if isinstance(space, spaces.MultiDiscrete) else int(np.prod(stored_shape(space)))
+
+
+def encode(values: th.Tensor, space: spaces.Space, normalize_images: bool) -> th.Tensor:
+    """
+    What SB3's ``preprocess_obs`` does to an entry; choices may count from any number and be of any shape.
+
+    :param values: of an entry, shape (B, ...)
+    :param space: of that entry
+    :param normalize_images: divide images by 255
+    :return: float32: Box and MultiBinary in their own shape, (B, 1) if that is (); one-hot, shape (B, F), for the others
+    """
+    if isinstance(space, spaces.Discrete):
+        return _one_hot(values.reshape(-1), space.n, space.start)
+    if isinstance(space, spaces.MultiDiscrete):
+        columns = values.flatten(1).unbind(1)
+        choices = zip(columns, space.nvec.ravel(), space.start.ravel(), strict=True)
+        return th.cat([_one_hot(*column) for column in choices], dim=-1)
+    if space.shape == ():
+        return values.float().unsqueeze(-1)
+    return preprocess_obs(values, space, normalize_images=normalize_images)  # type: ignore[return-value]
+
+
+def _one_hot(values: th.Tensor, n: Any, start: Any) -> th.Tensor:
+    """Shape (B, n); zeros for what is none of the choices, such as the padding of a sequence."""
+    return (values.long().unsqueeze(-1) == th.arange(int(start), int(start) + int(n), device=values.device)).float()
+
+
+def computable(array: np.ndarray) -> np.ndarray:
+    """
+    :param array: of any type that an entry may have
+    :return: the same, in a type that torch computes with
+    """
+    return array.astype(COMPUTABLE[array.dtype.name]) if array.dtype.name in COMPUTABLE else array
+
+
+# --- what users hand over -----------------------------------------------------------------------------------------------
+
+
+class EntryReader:
+    """
+    Takes an entry as ``predict`` is given it, whatever holds the numbers, or says what is wrong with it.
+
+    :param key: its name
+    :param space: of the entry
+    """
+
+    def __init__(self, key: str, space: spaces.Space):
+        self.key, self.space = key, space
+        self.shape: tuple[int, ...] = space.shape  # type: ignore[assignment]
+        self.dtype = np.dtype(space.dtype)
+        self.bounds = index_bounds(space)
+        self.is_image = is_image_space(space)
+
+    def read(self, value: Any) -> tuple[np.ndarray, int | None]:
+        """
+        :param value: one of the entry, or B of them, as an array, a tensor, a list or a number; images in either layout
+        :return: a copy of shape (B, \\*entry shape), and B; ``None`` instead if it was one by itself
+        :raises ValueError: naming the entry, if its type or its shape is another, or its values are none that it can have
+        """
+        array = self._with_layout(self._as_array(value))
+        if array.dtype != self.dtype or self.dtype.kind == "f":
+            array = self._as_declared(array)
+        if self.bounds is not None:
+            inside = (array >= self.bounds[0]) & (array <= self.bounds[1])
+            if not inside.all():
+                raise self._fault(f"holds {array[~inside][0]}, which is not in {self.space}")
+        return (array[None], None) if array.shape == self.shape else (array, len(array))
+
+    def _as_array(self, value: Any) -> np.ndarray:
+        if isinstance(value, th.Tensor):
+            value = value.detach().cpu().numpy()
+        try:
+            array = np.array(value)
+        except ValueError:  # nested lists of different lengths
+            raise self._fault(f"is not an array: {value!r:.80}") from None
+        if array.dtype.kind not in "biuf":
+            raise self._fault(f"is of type {type(value).__name__}, expected numbers of type {self.dtype}")
+        if array.dtype.itemsize > 8 or not array.dtype.isnative:  # torch knows neither
+            array = array.astype(np.float64 if array.dtype.itemsize > 8 else array.dtype.newbyteorder("="))
+        return array
+
+    def _with_layout(self, array: np.ndarray) -> np.ndarray:
+        """With the channels where the space has them."""
+        if array.shape == self.shape or (array.shape[1:] == self.shape and array.ndim):
+            return array
+        if self.is_image and array.ndim in (3, 4):
+            transposed = VecTransposeImage.transpose_image(array)
+            if self.shape in (transposed.shape, transposed.shape[1:]):
+                return transposed
+        raise self._fault(f"has shape {array.shape}, expected {self.shape}, or (B, ...) of it")
+
+    def _as_declared(self, array: np.ndarray) -> np.ndarray:
+        """Floats as they are, where it is measured: networks take all of them, and normalised integers are floats as well."""
+        if array.dtype.kind == "f" and not is_finite(array, array.dtype):
+            raise self._fault("holds NaN or infinite values: no action can follow from it")
+        if self.is_image and array.dtype.kind in "fb":
+            raise self._fault(
+                f"is an image of type {array.dtype}, expected bytes from 0 to 255, as in training. "
+                "Pass (image * 255).astype(np.uint8) if its values are from 0 to 1"
+            )
+        if self.dtype.kind == "f" or (array.dtype.kind == "f" and self.bounds is None):
+            if array.dtype.kind == "f" and not is_finite(array, FLOAT32):
+                raise self._fault("holds values that float32 can't hold")
+            return array
+        if not held_by(self.dtype, array):
+            raise self._fault(f"has type {array.dtype} and values that the expected {self.dtype} can't hold")
+        return array.astype(self.dtype)
+
+    def _fault(self, what: str) -> ValueError:
+        return ValueError(f'The observation\'s entry "{self.key}" {what}.')
+
+
+class ObservationReader:
+    """
+    Takes observations as ``predict`` is given them.
+
+    :param space: of the entries to read
+    """
+
+    def __init__(self, space: spaces.Dict):
+        self.entries = [EntryReader(key, entry) for key, entry in space.spaces.items()]
+
+    def read(self, observation: Mapping[str, Any], device: th.device) -> tuple[dict[str, th.Tensor], bool]:
+        """
+        :param observation: entry -> one, or B of each; those that are not in the space are left out
+        :param device: of the result
+        :return: tensors of the space's entries that are there, shapes (B, ...), and whether they were batched
+        :raises ValueError: naming the entry that does not fit its space, or is not as many as the others
+        """
+        tensors, counts = {}, {}
+        for entry in self.entries:
+            if entry.key in observation:
+                rows, counts[entry.key] = entry.read(observation[entry.key])
+                tensors[entry.key] = th.as_tensor(computable(rows), device=device)
+        numbers = set(counts.values())
+        if len(numbers) > 1:
+            said = ", ".join(f'"{key}" {"one by itself" if n is None else f"a batch of {n}"}' for key, n in counts.items())
+            raise ValueError(
+                f"The observation's entries must each be one by itself, or batches of the same size, but {said}. "
+                "A batch has one dimension more than the entry's space."
+            )
+        return tensors, None not in numbers
+
+
+def check_is_observation(observation: Any) -> None:
+    """
+    :raises ValueError: if it is the pair that a gymnasium environment's ``reset()`` returns
+    """
+    if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
+        raise ValueError(
+            "predict() was given the pair (observation, info) that reset() of a gymnasium environment returns: pass it the "
+            "observation alone, as in: observation, info = env.reset()."
+        )

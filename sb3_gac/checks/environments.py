@@ -1,0 +1,330 @@
+"""What stands before vectorised environments: it names the environment that failed, before its values do harm."""
+
+import traceback
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
+
+from sb3_gac.checks.processes import KEPT, WatchedPipe, end_processes
+from sb3_gac.checks.uses import FINAL, EnvironmentUse, KeepingFinal, SuspiciousEnds
+from sb3_gac.checks.values import described, entries_of, fault_of, index_bounds, is_finite
+
+GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
+GUARD = "_environment_guard"
+TRUNCATED = "TimeLimit.truncated"  # SB3's name of an end by time limit in an info
+RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under FINAL
+REWARD_IS_TAKEN = (DummyVecEnv.step_wait.__code__, Monitor.step.__code__)  # by SB3, which makes a number of it
+NO_NUMBER = ("0-dimensional arrays", "size-1 arrays", "array element with a sequence", "float() argument")  # so numpy says it
+
+
+class InvalidStepError(ValueError):
+    """An observation, a reward or an action does not fit its space or is not finite."""
+
+
+class EnvironmentFailedError(RuntimeError):
+    """An environment raised, or its process died."""
+
+
+FAULTS = (InvalidStepError, EnvironmentFailedError)
+
+
+def guard_environments(env: VecEnv) -> None:
+    """
+    Before ``VecNormalize``, if there is one, learns from them, and before they are stored.
+
+    :param env: gets a guard, unless it has one
+    """
+    guarded = _guarded(env)
+    if GUARD not in vars(guarded):  # getattr would find that of an environment further in
+        vars(guarded)[GUARD] = EnvironmentGuard(guarded)
+
+
+def guard_of(env: VecEnv) -> "EnvironmentGuard":
+    """
+    :param env: of :func:`guard_environments`
+    :return: its guard
+    """
+    return vars(_guarded(env))[GUARD]
+
+
+def _guarded(env: VecEnv) -> VecEnv:
+    normalizer = unwrap_vec_normalize(env)
+    return env if normalizer is None else normalizer.venv
+
+
+class EnvironmentGuard:
+    """
+    Takes the place of an instance's ``reset``, ``step_async`` and ``step_wait``.
+
+    It is no wrapper, because SB3 goes through the wrappers of training and evaluation environments side by side
+    (``sync_envs_normalization``) and compares their types: a guard must not show.
+
+    :param env: vectorised environments
+    """
+
+    def __init__(self, env: VecEnv):
+        self.env, self.base = env, env.unwrapped
+        self._entries = _entries_in(env.observation_space)
+        self._base_entries = _entries_in(self.base.observation_space)
+        self._failure: str | None = None
+        self._calls = 0
+        self._uses_inside: list[EnvironmentUse] = []
+        self._ends = SuspiciousEnds()
+        #: SB3's own return new arrays; of others, and of wrappers, it is not known
+        self._returns_new_arrays = type(env) in (DummyVecEnv, SubprocVecEnv)
+        self._reset, self._step_async, self._step_wait = env.reset, env.step_async, env.step_wait
+        vars(env).update(reset=self.reset, step_async=self.step_async, step_wait=self.step_wait)
+        if isinstance(self.base, DummyVecEnv):
+            self._uses_inside = [EnvironmentUse.of(one) for one in self.base.envs]
+            if "_save_obs" not in vars(self.base):
+                self._save_obs = self.base._save_obs
+                vars(self.base)["_save_obs"] = self.save_obs
+                for index, one in enumerate(self.base.envs):
+                    KeepingFinal.of(one).add(self.base, index)
+        if isinstance(self.base, SubprocVecEnv) and not isinstance(self.base.remotes[0], WatchedPipe):
+            self.base.remotes = tuple(map(WatchedPipe, self.base.remotes, self.base.processes))
+
+    @property
+    def uses(self) -> int:
+        """Steps and resets so far, of these vectorised environments or, in this process, of an environment in them."""
+        return self._calls + sum(use.count for use in self._uses_inside)
+
+    # --- in the place of the environments' own ------------------------------------------------------------------------
+
+    def reset(self) -> Any:
+        """
+        :return: the environments' observations
+        :raises InvalidStepError: if one does not fit its space or is not finite
+        :raises EnvironmentFailedError: if an environment fails
+        """
+        self._calls += 1
+        observation = self._own(self._call(self._reset))
+        self._check_observation(observation)
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """
+        :param actions: one for each environment
+        :raises InvalidStepError: if one is not finite
+        :raises EnvironmentFailedError: if an environment's process has died
+        """
+        finite = np.isfinite(actions)
+        if not finite.all():
+            raise InvalidStepError(
+                f'The "action" of environment {np.argwhere(~finite)[0][0]} holds NaN or infinite values; no environment was '
+                "stepped. Check action_noise, if there is one; if not, the behaviour policy diverged: load an earlier state."
+            )
+        self._calls += 1
+        self._call(self._step_async, actions.copy())  # an environment may write into what it gets
+
+    def step_wait(self) -> Any:
+        """
+        :return: the environments' observations, rewards, dones and infos
+        :raises InvalidStepError: if one does not fit its space or is not finite
+        :raises EnvironmentFailedError: if an environment fails
+        """
+        observation, rewards, dones, infos = self._call(self._step_wait)
+        observation = self._own(observation)
+        if not self._returns_new_arrays:
+            rewards, dones = np.array(rewards), np.array(dones)
+        self._check_observation(observation)
+        _check_rows('The "reward"', rewards, REWARD)
+        self._check_ends(observation, dones, infos)
+        return observation, rewards, dones, infos
+
+    def save_obs(self, index: int, observation: Any) -> None:
+        """
+        DummyVecEnv would broadcast a wrong shape and cast a wrong type where it copies an observation into its buffer.
+
+        :param index: of the environment
+        :param observation: as it returned it
+        :raises InvalidStepError: if it does not fit its space or is not finite
+        """
+        entries = entries_of(observation)
+        for key, entry in self._base_entries.items():
+            value = entries.get(key)
+            if not (isinstance(value, np.ndarray) and value.shape == entry.shape and value.dtype == entry.dtype):
+                _check_entries(entries, {key: entry}, index)
+        self._save_obs(index, observation)
+
+    # --- checks -------------------------------------------------------------------------------------------------------
+
+    def _check_observation(self, observation: Any) -> None:
+        """One look at each entry of all environments together."""
+        entries = entries_of(observation)
+        for key, entry in self._entries.items():
+            _check_rows(f'The observation\'s entry "{key}"', entries[key], entry)
+
+    def _check_ends(self, observation: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
+        """An info tells of an episode's end when there is one, and then of this one."""
+        if len(infos) != len(dones):
+            raise InvalidStepError(
+                f"{len(dones)} environments returned {len(infos)} info dicts; nothing was stored. Return one each. {GO_ON}."
+            )
+        for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
+            if done:
+                if FINAL not in info:
+                    raise InvalidStepError(
+                        f'The episode of environment {index} ended, but its info has no "{FINAL}"; the step was not stored, '
+                        "for the observation returned with it is the next episode's first. SB3's VecEnv has an episode's last "
+                        f'observation in infos[i]["{FINAL}"]: put it there before the environment is reset; {GO_ON}.'
+                    )
+                _check_entries(info[FINAL], self._entries, index, "The last observation's entry")
+                info[RAW_FINAL] = info[FINAL]
+            elif (FINAL in info or info.get(TRUNCATED)) and not _is_of_another(info, index, dones, infos):
+                for key in (FINAL, TRUNCATED, RAW_FINAL):  # left from an earlier end, in a dict that is used again
+                    info.pop(key, None)
+        if dones.any():
+            _check_own_infos(dones, infos)
+        self._ends.look_at(observation, dones, infos)
+
+    def _own(self, observation: Any) -> Any:
+        """Arrays that no later step changes."""
+        if self._returns_new_arrays:
+            return observation
+        return deepcopy(observation)
+
+    # --- failures -----------------------------------------------------------------------------------------------------
+
+    def _call(self, method: Callable[..., Any], *args: Any) -> Any:
+        if self._failure is not None:
+            raise EnvironmentFailedError(self._failure)
+        try:
+            return method(*args)
+        except FAULTS:
+            raise
+        except Exception as error:
+            fault = self._explained(error)
+            if fault is None:
+                raise
+            raise fault from error
+
+    def _explained(self, error: Exception) -> Exception | None:
+        """What to raise instead of an error that came out of an environment; ``None`` if it came from elsewhere."""
+        if isinstance(self.base, SubprocVecEnv) and isinstance(error, (EOFError, OSError)):
+            self._failure = end_processes(self.base)
+            return EnvironmentFailedError(self._failure)
+        frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+        said = described(error)
+        if frames[-1].f_code in REWARD_IS_TAKEN and any(words in str(error) for words in NO_NUMBER):
+            said += " Its reward must be a single number, such as float(reward[0])."
+        for frame in frames:  # SB3's own loops know which environment they are at
+            if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
+                return EnvironmentFailedError(
+                    f"Environment {frame.f_locals['env_idx']} raised {said} {KEPT}: mend the "
+                    f"environment; {GO_ON}, or set_env(...) first gives the model another one."
+                )
+            if frame.f_code.co_name == "_stack_obs":
+                for number, observation in enumerate(frame.f_locals["obs_list"]):
+                    try:
+                        _check_entries(observation, self._base_entries, number)
+                    except InvalidStepError as fault:
+                        return fault
+        return None
+
+
+class Entry(NamedTuple):
+    """
+    What is to be known of an entry in every step.
+
+    :param space: of one environment's
+    :param shape: of that space
+    :param dtype: of that space
+    :param bounds: see :func:`index_bounds`
+    """
+
+    space: spaces.Space
+    shape: tuple[int, ...] | None
+    dtype: Any
+    bounds: tuple[Any, Any] | None
+
+    @classmethod
+    def of(cls, space: spaces.Space) -> "Entry":
+        """
+        :param space: of one environment's
+        """
+        return cls(space, space.shape, space.dtype, index_bounds(space))
+
+
+REWARD = Entry.of(spaces.Box(-np.inf, np.inf, (), np.float32))
+
+
+def _entries_in(space: spaces.Space) -> dict[str, Entry]:
+    """Those of an observation's entries that are single arrays."""
+    entries = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+    return {key: Entry.of(entry) for key, entry in entries.items() if entry.shape is not None}
+
+
+def _check_entries(observation: Any, expected: dict[str, Entry], index: int, what: str = "The observation's entry") -> None:
+    """
+    :param observation: of one environment
+    :param expected: its entries
+    :param index: of the environment
+    :param what: the entries' kind, for the message
+    :raises InvalidStepError: naming the entry and the environment
+    """
+    entries = entries_of(observation)
+    for key, entry in expected.items():
+        fault = fault_of(entries[key], entry.space) if key in entries else "is missing"
+        if fault is not None:
+            raise InvalidStepError(_message(f'{what} "{key}"', index, fault))
+
+
+def _check_rows(name: str, rows: Any, entry: Entry) -> None:
+    """
+    One look at all environments together; at each by itself only if something may be wrong.
+
+    :param name: for the message
+    :param rows: one for each environment
+    :param entry: what each is to be
+    :raises InvalidStepError: naming the environment
+    """
+    bounds = entry.bounds
+    if (
+        isinstance(rows, np.ndarray)
+        and rows.shape[1:] == entry.shape
+        and _comes_in(rows.dtype, entry.dtype)
+        and is_finite(rows, entry.dtype)
+        and (bounds is None or ((rows >= bounds[0]) & (rows <= bounds[1])).all())
+    ):
+        return
+    for index, row in enumerate(rows):
+        fault = fault_of(row, entry.space)
+        if fault is not None:
+            raise InvalidStepError(_message(name, index, fault))
+
+
+def _comes_in(given: Any, expected: Any) -> bool:
+    """Whether the type is the expected one, or one whose numbers a floating-point entry takes as they are."""
+    return given == expected or (expected.kind == "f" and given.kind in "biuf")
+
+
+def _message(name: str, index: int, fault: str) -> str:
+    return (
+        f"{name} of environment {index} {fault}; it was not stored. Check the environment's simulation and its wrappers; "
+        f"{GO_ON}."
+    )
+
+
+def _is_of_another(info: dict[str, Any], index: int, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> bool:
+    """Whether the info is the very dict of another environment, whose episode has ended."""
+    return any(infos[other] is info for other in np.flatnonzero(dones).tolist() if other != index)
+
+
+def _check_own_infos(dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
+    """
+    :raises InvalidStepError: if two environments whose episodes have ended have one info between them
+    """
+    ended = np.flatnonzero(dones).tolist()
+    for position, index in enumerate(ended):
+        for other in ended[:position]:
+            if infos[other] is infos[index]:
+                raise InvalidStepError(
+                    f"The episodes of environments {other} and {index} ended, but they share one info dict, which can hold "
+                    f'the "{FINAL}" of one of them only; the step was not stored. Return a dict for each environment; {GO_ON}.'
+                )

@@ -1,0 +1,90 @@
+"""What algorithms and SB3's ``HerReplayBuffer`` need of an environment, looked at before training."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_gac.checks.entries import check_entries, stored_shape
+from sb3_gac.checks.values import check_box_actions
+
+GOALS = ("achieved_goal", "desired_goal")
+REWARDS_OF_GOALS = (
+    "HerReplayBuffer calls compute_reward(achieved_goals, desired_goals, infos) with N rows of each, and needs N rewards, as "
+    "an array of shape (N,): take norms and comparisons along the last axis, and return no single number."
+)
+
+
+def check_environment(env: GymEnv) -> None:
+    """
+    :param env: as it is given to a model
+    :raises ValueError: if it is one of gymnasium's vector environments, or naming an observation entry, or a component of Box
+        actions, that there is no learning with
+    """
+    if isinstance(env, VectorEnv):
+        raise ValueError(
+            f"env is one of gymnasium's vector environments ({type(env).__name__}), but SB3's algorithms take SB3's own, "
+            "VecEnv: make it with stable_baselines3.common.env_util.make_vec_env(<id or class>, n_envs=...)."
+        )
+    check_entries(env.observation_space)
+    if isinstance(env.action_space, spaces.Box):
+        check_box_actions(env.action_space)
+
+
+def check_goals(buffer_class: Any, space: spaces.Dict, env: VecEnv | None) -> None:
+    """
+    :param buffer_class: ``replay_buffer_class``
+    :param space: of the observations
+    :param env: whose ``compute_reward`` rewards other goals; ``None`` where there is none
+    :raises ValueError: if this is ``HerReplayBuffer`` and there are no goals, or there is no ``compute_reward``
+    """
+    if not _is_hindsight(buffer_class):
+        return
+    name, entries = buffer_class.__name__, space.spaces
+    if not set(GOALS) <= set(entries):
+        raise ValueError(
+            f"replay_buffer_class={name} replaces goals in the observation's entries {list(GOALS)}, but the observation has "
+            f"{list(entries)}. Leave the goal environment's observation as it is, and say with role_keys who sees what of it: "
+            'role_keys={"learner": ["observation", "desired_goal"]}.'
+        )
+    achieved, desired = (entries[goal] for goal in GOALS)
+    if stored_shape(achieved) != stored_shape(desired):
+        raise ValueError(
+            f'replay_buffer_class={name} puts the entry "achieved_goal" in the place of "desired_goal", but they are '
+            f"{achieved} and {desired}: give them one shape."
+        )
+    if env is not None and not env.has_attr("compute_reward"):
+        raise ValueError(f"The environment has no method compute_reward. {REWARDS_OF_GOALS}")
+
+
+def check_rewards_of_goals(buffer_class: Any, buffer_kwargs: Mapping[str, Any], env: VecEnv) -> None:
+    """
+    Calls ``compute_reward`` as ``HerReplayBuffer`` will, on goals of zeros.
+
+    :param buffer_class: ``replay_buffer_class``
+    :param buffer_kwargs: of it
+    :param env: after its reset
+    :raises ValueError: if ``compute_reward`` does not reward many goals at once
+    """
+    if not _is_hindsight(buffer_class) or buffer_kwargs.get("copy_info_dict", False):  # what is in infos can't be known
+        return
+    goals_of = [env.observation_space.spaces[goal] for goal in GOALS]  # type: ignore[attr-defined]
+    shape = stored_shape(goals_of[0])
+    n_rows = next(n for n in range(2, len(shape) + 3) if n not in shape)  # so that another axis shows
+    goals = [np.zeros((n_rows, *shape), dtype=goal.dtype) for goal in goals_of]
+    try:
+        (rewards,) = env.env_method("compute_reward", *goals, [{} for _ in range(n_rows)], indices=[0])
+    except Exception as error:
+        raise ValueError(f"compute_reward fails on {n_rows} rows of goals ({error!r}). {REWARDS_OF_GOALS}") from error
+    if not isinstance(rewards, np.ndarray) or rewards.size != n_rows:
+        said = f"{type(rewards).__name__} of shape {np.shape(rewards)}"
+        raise ValueError(f"compute_reward returns {said} for {n_rows} rows of goals. {REWARDS_OF_GOALS}")
+
+
+def _is_hindsight(buffer_class: Any) -> bool:
+    return isinstance(buffer_class, type) and issubclass(buffer_class, HerReplayBuffer)

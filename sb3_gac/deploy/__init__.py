@@ -1,0 +1,1 @@
+"""The deployed policy on its way to the robot."""

@@ -1,0 +1,283 @@
+"""
+The deployed policy as a file for the robot: ONNX or TorchScript, from raw observations to actions in the environment's range.
+
+Nothing but the deployed policy goes into the file: no guider, no critics, and no input for what is privileged.
+"""
+
+import json
+import tempfile
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from torch import nn
+
+from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.checks.entries import computable
+from sb3_gac.checks.values import check_positive, index_bounds
+from sb3_gac.deploy.normalization import DeploymentNormalizer
+from sb3_gac.deploy.verification import check_agreement, draw_observations
+from sb3_gac.networks.actors import DeployedPolicy
+from sb3_gac.networks.recurrent import Memory
+from sb3_gac.version import __version__
+
+ACTION, STATE, NEXT_STATE = "action", "state", "next_state"
+METADATA_KEY = "sb3_gac"
+PASSING_NAME = "sb3_gac::value::"  # of inputs and outputs, until they get their own
+COUNTED = ("smallest", "largest")  # values of what is counted, in the metadata
+ACTION_MEANINGS = {  # whether actions are continuous -> what they are
+    True: "the deterministic action, between low and high, for the environment's step()",
+    False: "number of the most probable action, from 0 to n - 1, for the environment's step()",
+}
+
+
+class DeployedModule(nn.Module):
+    """
+    A policy's deterministic action, normalisation and scaling included.
+
+    :param policy: to deploy
+    :param normalizer: of its observations, ``None`` for none
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(self, policy: DeployedPolicy, normalizer: DeploymentNormalizer | None):
+        super().__init__()
+        assert isinstance(policy.observation_space, spaces.Dict)
+        self.policy = policy
+        self.keys = list(policy.observation_space.spaces)
+        self.normalised = [key for key in self.keys if normalizer is not None and key in normalizer.mean]
+        for index, key in enumerate(self.normalised):  # buffers' names can't hold all that keys can
+            assert normalizer is not None
+            self.register_buffer(f"mean_{index}", th.as_tensor(normalizer.mean[key], dtype=th.float64))
+            std = np.sqrt(normalizer.var[key] + normalizer.epsilon)
+            self.register_buffer(f"std_{index}", th.as_tensor(std, dtype=th.float64))
+        self.action_name, self.state_name, self.next_state_name = (self._free(name) for name in (ACTION, STATE, NEXT_STATE))
+        self.clip_obs = 0.0 if normalizer is None else float(normalizer.clip_obs)
+        if isinstance(policy.action_space, spaces.Box):
+            # one-dimensional in any case: what is not, ONNX's exporter computes with in the action's float32
+            self.register_buffer("low", th.as_tensor(np.ravel(policy.action_space.low)))
+            self.register_buffer("high", th.as_tensor(np.ravel(policy.action_space.high)))
+
+    def _free(self, name: str) -> str:
+        """The name, told apart from an entry that is called the same."""
+        return self._free(f"{name}_") if name in self.keys else name
+
+    @property
+    def memory(self) -> Memory | None:
+        """Of a recurrent policy."""
+        return self.policy.memory  # type: ignore[return-value]
+
+    def forward(self, *inputs: th.Tensor) -> Any:
+        """
+        :param inputs: the policy's entries, (B, ...) each; with a memory, also what it remembers, shape (B, S), zeros at an
+            episode's start
+        :return: actions, shape (B, \\*action shape); with a memory, also what it remembers now
+        """
+        obs = {key: self._normalize(key, value) for key, value in zip(self.keys, inputs, strict=False)}
+        if self.memory is None:
+            return self._in_range(self.policy.distribution(obs).mode)
+        features = self.policy.extract_features(
+            {key: value[None] for key, value in obs.items()}, self.policy.features_extractor
+        )
+        outputs, after = self.memory(features, inputs[-1][None])
+        return self._in_range(self.policy.output(self.policy.latent_net(outputs[0, 0])).mode), after[0]
+
+    def _normalize(self, key: str, value: th.Tensor) -> th.Tensor:
+        if key not in self.normalised:
+            return value
+        index = self.normalised.index(key)
+        standardised = (value.double() - getattr(self, f"mean_{index}")) / getattr(self, f"std_{index}")
+        return standardised.clamp(-self.clip_obs, self.clip_obs).float()
+
+    def _in_range(self, action: th.Tensor) -> th.Tensor:
+        if not isinstance(self.policy.action_space, spaces.Box):
+            return action
+        scaled = self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+        scaled = th.minimum(scaled, self.high)  # as BoundedPolicy.unscale_action does
+        return scaled.reshape(-1, *self.policy.action_space.shape)
+
+
+def export_learner(
+    model: AsymmetricOffPolicyAlgorithm,
+    path: str | Path,
+    normalizer: DeploymentNormalizer | None = None,
+    units: dict[str, str] | None = None,
+    verify_on: int = 256,
+) -> Path:
+    """
+    Write a model's deployed policy to a file, once its actions there are the model's: see :class:`sb3_gac.learner.Learner`
+    for its use.
+
+    :param model: trained
+    :param path: with the suffix ".onnx", or ".pt" for TorchScript
+    :param normalizer: of the observations; by default that of the model's ``VecNormalize``, if it has one
+    :param units: entry, or "action" -> unit, kept in the file's metadata
+    :param verify_on: number of observations to compare the file's actions and those of ``predict`` on, see
+        :func:`sb3_gac.deploy.verification.check_agreement`
+    :return: the path
+    :raises ValueError: if the suffix is another, there is nothing to verify on, a unit is that of something else, or the
+        model learned under a ``VecNormalize`` that it does not have any more
+    :raises ImportError: if a file for ONNX is wanted, and onnx or onnxruntime is not installed
+    :raises ExportError: if the file's actions are not those of ``predict``; nothing is then written
+    """
+    path = Path(path)
+    if path.suffix not in WRITERS:
+        raise ValueError(f'path must end in ".onnx" or, for TorchScript, ".pt", got {str(path)!r}.')
+    check_positive("verify_on", verify_on)
+    normalizer = _normalizer_of(model) if normalizer is None else normalizer
+    module = DeployedModule(deepcopy(model.policy.deployed), normalizer).cpu().eval().requires_grad_(False)
+    metadata = json.dumps(describe(module, type(model).__name__, units or {}), allow_nan=False)
+    with th.no_grad(), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as directory:
+        written = Path(directory) / path.name
+        WRITERS[path.suffix](module, written, metadata)
+        check_agreement(module.policy, written, normalizer, verify_on)
+        written.replace(path)
+    return path
+
+
+def _normalizer_of(model: AsymmetricOffPolicyAlgorithm) -> DeploymentNormalizer | None:
+    vec_normalize = model.get_vec_normalize_env()
+    if vec_normalize is None and model.trained_normalised:
+        raise ValueError(
+            "The model learned from observations that VecNormalize normalised, but was loaded without it: load it with "
+            'env=VecNormalize.load("<its statistics>", venv), or pass normalizer=DeploymentNormalizer.from_vec_normalize(...).'
+        )
+    if vec_normalize is None:
+        return None
+    keys = model.policy.role_keys[model.policy.roles.deployed]
+    normalizer = DeploymentNormalizer.from_vec_normalize(vec_normalize, keys)
+    wrapper = model.replay_source.in_the_way
+    if wrapper is not None and normalizer.mean:
+        raise ValueError(
+            f"{type(wrapper).__name__} stands outside VecNormalize: what the policy reads of {list(normalizer.mean)} is not "
+            "what VecNormalize has statistics of. Train with it outermost, or pass normalizer=DeploymentNormalizer(...) "
+            "with the statistics of what the policy reads."
+        )
+    return normalizer
+
+
+def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> dict[str, Any]:
+    """
+    :param module: to export
+    :param algorithm: name of its class
+    :param units: entry, or "action" -> unit
+    :return: what its file says of itself, as JSON holds it: entries and actions with shapes, types, bounds (``None`` where
+        there is none) and units, smallest and largest value of what is counted, and the memory to be carried from one action
+        to the next (``None`` without one)
+    :raises ValueError: if a unit is that of something else, or a name has a null character
+    """
+    unknown = sorted(set(units) - {*module.keys, module.action_name})
+    if unknown:
+        raise ValueError(f"units names {unknown}, but the policy reads {module.keys} and gives {module.action_name!r}.")
+
+    if any("\0" in key for key in module.keys):
+        raise ValueError(f"The policy reads {module.keys}, but no file can name an entry with a null character: rename it.")
+
+    def of(name: str, space: spaces.Space) -> dict[str, Any]:
+        box: dict[str, Any] = {}
+        if isinstance(space, spaces.Box):
+            box = {"low": _finite(space.low), "high": _finite(space.high)}
+        elif isinstance(space, spaces.Discrete):
+            box = {"n": int(space.n)}
+        if is_image_space(space):
+            box |= {"layout": "channels first" if is_image_space_channels_first(space) else "channels last"}  # type: ignore
+        dtype = str(computable(np.empty(0, space.dtype)).dtype)
+        return {"name": name, "shape": list(space.shape or ()), "dtype": dtype, "unit": units.get(name), **box}
+
+    def of_entry(name: str, space: spaces.Space) -> dict[str, Any]:
+        bounds = index_bounds(space)  # of what is counted, in the space's shape or for all of it
+        if bounds is None:
+            return of(name, space)
+        return of(name, space) | {what: np.asarray(bound).tolist() for what, bound in zip(COUNTED, bounds, strict=True)}
+
+    assert isinstance(module.policy.observation_space, spaces.Dict)
+    memory = None
+    if module.memory is not None:
+        memory = {
+            "input": module.state_name,
+            "output": module.next_state_name,
+            "size": module.memory.state_size,
+            "initial": 0.0,
+        }
+    action_space = module.policy.action_space
+    return {
+        "version": __version__,
+        "algorithm": algorithm,
+        "entries": [of_entry(key, space) for key, space in module.policy.observation_space.items()],
+        "action": of(module.action_name, action_space) | {"meaning": ACTION_MEANINGS[isinstance(action_space, spaces.Box)]},
+        "memory": memory,
+        "normalised": module.normalised,
+    }
+
+
+def _finite(bounds: np.ndarray) -> list[float | None]:
+    return [bound if np.isfinite(bound) else None for bound in np.ravel(bounds).tolist()]
+
+
+def _example(module: DeployedModule) -> tuple[th.Tensor, ...]:
+    """Two observations, of no importance."""
+    entries = [computable(value) for value in draw_observations(module.policy, None, 2).values()]
+    state = [] if module.memory is None else [np.zeros((2, module.memory.state_size), dtype=np.float32)]
+    return tuple(th.as_tensor(value) for value in (*entries, *state))
+
+
+def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
+    try:
+        import onnx
+        import onnxruntime  # noqa: F401, with which the file is compared
+    except ImportError as error:
+        raise ImportError(f'A file for ONNX needs onnx and onnxruntime: pip install "sb3_gac[export]" ({error}).') from error
+
+    remembers = module.memory is not None
+    inputs = [*module.keys, *[module.state_name] * remembers]
+    outputs = [module.action_name, *[module.next_state_name] * remembers]
+    # torch takes no number as a name, and does not tell an entry from a parameter of the same name
+    names = {f"{PASSING_NAME}{index}": name for index, name in enumerate([*inputs, *outputs])}
+    passing = list(names)
+    th.onnx.export(
+        module,
+        _example(module),
+        str(path),
+        input_names=passing[: len(inputs)],
+        output_names=passing[len(inputs) :],
+        dynamic_axes={name: {0: "batch"} for name in passing},
+        dynamo=False,
+    )
+    proto = onnx.load(str(path))
+    _rename(proto.graph, names)
+    onnx.helper.set_model_props(proto, {METADATA_KEY: metadata})
+    onnx.save(proto, str(path))
+
+
+def _rename(graph: Any, names: dict[str, str]) -> None:
+    """
+    :param graph: of ONNX, changed in place
+    :param names: of values -> new ones; a value that is called like a new one gets another name
+    """
+    values = [*graph.input, *graph.output, *graph.initializer, *graph.value_info]
+    known = {value.name for value in values}.union(*(set(node.output) for node in graph.node))
+    renamed = dict(names)
+    for name in known & set(names.values()):
+        other = f"{name}_"
+        while other in known or other in renamed.values():
+            other += "_"
+        renamed[name] = other
+    for value in values:
+        value.name = renamed.get(value.name, value.name)
+    for node in graph.node:
+        node.input[:] = [renamed.get(name, name) for name in node.input]
+        node.output[:] = [renamed.get(name, name) for name in node.output]
+
+
+def _write_torchscript(module: DeployedModule, path: Path, metadata: str) -> None:
+    traced = th.jit.trace(module, _example(module), check_trace=False)
+    th.jit.save(traced, str(path), _extra_files={METADATA_KEY: metadata})
+
+
+WRITERS = {".onnx": _write_onnx, ".pt": _write_torchscript}

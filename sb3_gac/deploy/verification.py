@@ -1,0 +1,115 @@
+"""Does an exported file act as the policy does? Compared on observations that are drawn, before the file is handed out."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_gac.deploy.normalization import DeploymentNormalizer
+from sb3_gac.networks.actors import DeployedPolicy
+
+TOLERANCE = 1e-5
+SHARE_OF_OUTLIERS = 0.1  # of what is drawn of normalised entries: many are clipped
+STEPS = 8  # of the sequences that policies with a memory are compared on
+Entries = dict[str, np.ndarray]
+
+
+class ExportError(RuntimeError):
+    """An exported file's actions are not the policy's."""
+
+
+@th.no_grad()
+def check_agreement(
+    policy: DeployedPolicy, path: Path, normalizer: DeploymentNormalizer | None, n: int, seed: int = 0
+) -> None:
+    """
+    Compare a file's actions with those of ``predict``. Continuous ones may differ by 1e-5 of half their range (or of their
+    value, if that is larger), discrete ones where two logits differ by less than 1e-5.
+
+    :param policy: that was exported, on the CPU
+    :param path: of its file
+    :param normalizer: of its observations, ``None`` for none
+    :param n: number of observations; with a memory, of sequences of 8 of them
+    :param seed: of the observations
+    :raises ExportError: if the actions differ by more
+    """
+    act = (_onnx_runner if path.suffix == ".onnx" else _torchscript_runner)(path, policy, n)
+    state = None
+    for step in range(1 if policy.memory is None else STEPS):
+        raw = draw_observations(policy, normalizer, n, seed + step)
+        seen = raw if normalizer is None else normalizer(raw)
+        error = _error(policy, seen, state, act(raw))
+        if not error <= TOLERANCE:
+            raise ExportError(
+                f"The actions of the exported {path.name} differ from those of predict() by up to {error:.2g}, more than "
+                f"{TOLERANCE:g}: it was not written. A features extractor of one's own must not branch on values, and must do "
+                "the same in every call."
+            )
+        _, state = policy.predict(seen, state, deterministic=True)
+
+
+def draw_observations(policy: DeployedPolicy, normalizer: DeploymentNormalizer | None, n: int, seed: int = 0) -> Entries:
+    """
+    :param policy: whose entries to draw
+    :param normalizer: those that it normalises are drawn from its statistics, all others from their space, without the far
+        ends of wide ones
+    :param n: number of observations, N
+    :param seed: of the draw
+    :return: entry -> shape (N, ...)
+    """
+    rng = np.random.default_rng(seed)
+    assert isinstance(policy.observation_space, spaces.Dict)
+    entries = {}
+    for key, space in policy.observation_space.items():
+        space.seed(int(rng.integers(2**31)))
+        drawn = np.stack([np.asarray(space.sample()) for _ in range(n)])
+        if np.issubdtype(drawn.dtype, np.floating):
+            if normalizer is not None and key in normalizer.mean:
+                scale = np.where(rng.random(drawn.shape) < SHARE_OF_OUTLIERS, 2.0 * normalizer.clip_obs, 2.0)
+                drawn = normalizer.mean[key] + rng.normal(scale=scale) * np.sqrt(normalizer.var[key])
+            elif not ((space.high - space.low) < 1e3).all():  # type: ignore[attr-defined]
+                drawn = np.clip(rng.normal(scale=2.0, size=drawn.shape), space.low, space.high)  # type: ignore[attr-defined]
+        entries[key] = drawn.astype(space.dtype)
+    return entries
+
+
+def _error(policy: DeployedPolicy, seen: Entries, state: tuple[np.ndarray, ...] | None, actions: np.ndarray) -> float:
+    """
+    :param policy: that was exported
+    :param seen: normalised observations, (N, ...) each
+    :param state: what the policy remembers, ``None`` at the start
+    :param actions: of the file, shape (N, \\*action shape)
+    :return: the largest difference, in the terms of :func:`check_agreement`
+    """
+    space = policy.action_space
+    if isinstance(space, spaces.Box):
+        expected, _ = policy.predict(seen, state, deterministic=True)
+        scale = np.maximum(np.abs(expected), (space.high - space.low) / 2)
+        return float(np.max(np.abs(actions - expected) / scale)) if actions.shape == expected.shape else np.inf
+    obs, _ = policy.obs_to_tensor(seen)
+    distribution, _ = policy.remember(obs, None if state is None else state[0], None)
+    logits = distribution.logits  # type: ignore[union-attr]
+    chosen = logits.gather(-1, th.as_tensor(actions).long().reshape(-1, 1)).squeeze(-1)
+    return float((logits.max(dim=-1).values - chosen).max())
+
+
+def _onnx_runner(path: Path, policy: DeployedPolicy, n: int) -> Callable[[Entries], np.ndarray]:
+    from sb3_gac.learner import Learner
+
+    return Learner.load(path).act
+
+
+def _torchscript_runner(path: Path, policy: DeployedPolicy, n: int) -> Callable[[Entries], np.ndarray]:
+    module = th.jit.load(str(path))
+    state = [] if policy.memory is None else [th.zeros(n, policy.memory.state_size)]  # type: ignore[call-overload]
+
+    def act(raw: Entries) -> np.ndarray:
+        result = module(*(th.as_tensor(value) for value in raw.values()), *state)
+        if not state:
+            return result.numpy()
+        action, state[0] = result
+        return action.numpy()
+
+    return act

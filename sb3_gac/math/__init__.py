@@ -1,0 +1,1 @@
+"""Equations as plain functions of tensors, and the distributions of actions."""

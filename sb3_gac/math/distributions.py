@@ -1,0 +1,215 @@
+"""
+Action distributions: tanh-squashed diagonal Gaussians, of which guider and learner share a std, and categorical ones.
+
+Both answer the same questions, so that one update serves both: the expected value and log-probability of their actions
+(by one sample, or exactly), KL divergence, a correction on top of another, and what one borrows of another.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import torch as th
+import torch.nn.functional as F
+
+KL_REDUCTIONS = ("mean", "sum")
+#: Actions, or None for all of them -> values, see the critic ensembles
+QFunction: TypeAlias = Callable[[Any], th.Tensor]
+_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+class TanhGaussian(NamedTuple):
+    """
+    tanh(N(mean, exp(log_std)^2)), independent per action dimension.
+
+    :param mean: mean before tanh, shape (\\*E, A)
+    :param log_std: log standard deviation before tanh, shape (\\*E, A)
+    """
+
+    mean: th.Tensor
+    log_std: th.Tensor
+
+    @property
+    def mode(self) -> th.Tensor:
+        """Deterministic action in [-1, 1], shape (\\*E, A)."""
+        return th.tanh(self.mean)
+
+    def detach(self) -> "TanhGaussian":
+        """The same distribution as a constant."""
+        return TanhGaussian(self.mean.detach(), self.log_std.detach())
+
+    def sample(self) -> th.Tensor:
+        """Reparameterised action in [-1, 1], shape (\\*E, A)."""
+        return th.tanh(self._pre_tanh(th.randn_like(self.mean)))
+
+    def sample_with_log_prob(self, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Reparameterised action and its log-probability.
+
+        :param noise: standard normal, shape (\\*E, A)
+        :return: action in [-1, 1], shape (\\*E, A), and log-probability, shape (\\*E)
+        """
+        pre_tanh = self._pre_tanh(noise)
+        return th.tanh(pre_tanh), self._log_prob(pre_tanh, noise)
+
+    def expectation(self, q_function: QFunction, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param q_function: actions -> values of N critics, shape (N, \\*E)
+        :param noise: standard normal, shape (\\*E, A)
+        :return: values of one sample, shape (N, \\*E), and its log-probability, shape (\\*E)
+        """
+        action, log_prob = self.sample_with_log_prob(noise)
+        return q_function(action), log_prob
+
+    def kl(self, other: "TanhGaussian", reduction: str = "sum") -> th.Tensor:
+        """
+        KL(self || other), shape (\\*E): of any two, whatever their stds; tanh is a bijection, so it is also the KL after it.
+
+        :param other: shapes (\\*E, A)
+        :param reduction: over action dimensions, "sum" (the definition) or "mean"
+        """
+        log_ratio = other.log_std - self.log_std
+        distance = (self.mean - other.mean) * th.exp(-other.log_std)
+        per_dimension = log_ratio + 0.5 * (th.exp(-2 * log_ratio) + distance.square() - 1)
+        return _reduced(per_dimension, reduction)
+
+    def kl_of_means(self, other: "TanhGaussian", reduction: str = "mean") -> th.Tensor:
+        """
+        KL(self || other), shape (\\*E), of two that share the std of ``other``, and that moves the means alone: see
+        :func:`kl_shared_std`.
+
+        :param other: shapes (\\*E, A)
+        :param reduction: over action dimensions, "sum" or "mean"
+        """
+        return kl_shared_std(self.mean, other.mean, other.log_std.detach().exp(), reduction)
+
+    def corrected(self, correction: "TanhGaussian") -> "TanhGaussian":
+        """
+        This distribution, as a constant, with its mean moved by a correction, and the correction's std.
+
+        :param correction: its mean counts in units of its std; shapes (\\*E, A)
+        """
+        mean = self.mean.detach() + correction.log_std.detach().exp() * correction.mean
+        return TanhGaussian(mean, correction.log_std)
+
+    def borrowing(self, lender: "TanhGaussian") -> "TanhGaussian":
+        """This mean with the lender's std, as a constant."""
+        return TanhGaussian(self.mean, lender.log_std.detach())
+
+    def diagnostics(self) -> dict[str, th.Tensor]:
+        """Name -> what to log the average of, detached, shape (\\*E)."""
+        return {"std": self.log_std.detach().exp().mean(dim=-1), "mean_abs": self.mean.detach().abs().mean(dim=-1)}
+
+    def log_prob(self, pre_tanh: th.Tensor) -> th.Tensor:
+        """
+        Log-density of the action tanh(pre_tanh).
+
+        :param pre_tanh: action before tanh, shape (\\*E, A)
+        :return: shape (\\*E)
+        """
+        return self._log_prob(pre_tanh, (pre_tanh - self.mean) * th.exp(-self.log_std))
+
+    def _pre_tanh(self, noise: th.Tensor) -> th.Tensor:
+        return th.addcmul(self.mean, self.log_std.exp(), noise)
+
+    def _log_prob(self, pre_tanh: th.Tensor, standardised: th.Tensor) -> th.Tensor:
+        """
+        log N(x; mean, std) - log(1 - tanh(x)^2), summed over dimensions, the constants once at the end; with
+        log(1 - tanh(x)^2) = 2 (log 2 - x - log(1 + exp(-2 x))), which does not cancel for large |x|.
+        """
+        log_cosh = pre_tanh + F.softplus(pre_tanh * -2.0)  # but for a constant
+        summed = th.addcmul(th.sub(log_cosh, self.log_std, alpha=0.5), standardised, standardised, value=-0.25).sum(dim=-1)
+        return 2.0 * summed - pre_tanh.shape[-1] * (_LOG_SQRT_2PI + 2.0 * math.log(2.0))
+
+
+class Categorical(NamedTuple):
+    """
+    One of A actions.
+
+    :param logits: unnormalised log-probabilities, shape (\\*E, A)
+    """
+
+    logits: th.Tensor
+
+    @property
+    def mode(self) -> th.Tensor:
+        """The likeliest action, int64, shape (\\*E)."""
+        return self.logits.argmax(dim=-1)
+
+    def detach(self) -> "Categorical":
+        """The same distribution as a constant."""
+        return Categorical(self.logits.detach())
+
+    def sample(self) -> th.Tensor:
+        """An action, int64, shape (\\*E)."""
+        gumbel = -th.empty_like(self.logits).exponential_().log()
+        return (self.logits + gumbel).argmax(dim=-1)
+
+    def expectation(self, q_function: QFunction, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Exact, over all actions, and with the smallest critic's value of each.
+
+        :param q_function: None -> values of N critics, shape (N, \\*E, A)
+        :param noise: not needed
+        :return: expected value, shape (1, \\*E), and expected log-probability, shape (\\*E)
+        """
+        log_probs = self.logits.log_softmax(dim=-1)
+        probs = log_probs.exp()
+        return (probs * q_function(None).amin(dim=0)).sum(dim=-1)[None], (probs * log_probs).sum(dim=-1)
+
+    def kl(self, other: "Categorical", reduction: str = "sum") -> th.Tensor:
+        """KL(self || other), shape (\\*E); there are no dimensions to reduce over."""
+        log_probs = self.logits.log_softmax(dim=-1)
+        return (log_probs.exp() * (log_probs - other.logits.log_softmax(dim=-1))).sum(dim=-1)
+
+    def kl_of_means(self, other: "Categorical", reduction: str = "sum") -> th.Tensor:
+        """KL(self || other), shape (\\*E): there is no std to share."""
+        return self.kl(other)
+
+    def corrected(self, correction: "Categorical") -> "Categorical":
+        """This distribution, as a constant, with its logits moved by the correction's."""
+        return Categorical(self.logits.detach() + correction.logits)
+
+    def borrowing(self, lender: "Categorical") -> "Categorical":
+        """Itself: there is no std to borrow."""
+        return self
+
+    def diagnostics(self) -> dict[str, th.Tensor]:
+        """Name -> what to log the average of, detached, shape (\\*E)."""
+        return {"max_prob": self.logits.detach().softmax(dim=-1).amax(dim=-1)}
+
+
+Distribution: TypeAlias = TanhGaussian | Categorical
+
+
+def kl_shared_std(guider_mean: th.Tensor, learner_mean: th.Tensor, std: th.Tensor, reduction: str = "mean") -> th.Tensor:
+    """
+    KL(mu || pi) of two diagonal Gaussians with one std; tanh is a bijection, so it is also the KL after it.
+
+    :param guider_mean: shape (\\*E, A)
+    :param learner_mean: shape (\\*E, A)
+    :param std: shape (\\*E, A); detach it, the KL must not move the std
+    :param reduction: over action dimensions, "sum" (the definition) or "mean"
+    :return: shape (\\*E)
+    """
+    return _reduced(0.5 * ((guider_mean - learner_mean) / std).square(), reduction)
+
+
+def _reduced(per_dimension: th.Tensor, reduction: str) -> th.Tensor:
+    return per_dimension.mean(dim=-1) if reduction == "mean" else per_dimension.sum(dim=-1)
+
+
+def project_to_kl_ball(offset: th.Tensor, max_kl: float, reduction: str = "mean") -> th.Tensor:
+    """
+    Shrink a mean offset, in units of the shared std, until its KL = 1/2 \\|\\|offset\\|\\|^2 is at most ``max_kl``.
+
+    Differentiable trust region projection (arXiv 2101.09207) for the mean of a Gaussian with a shared std.
+
+    :param offset: (guider mean - learner mean) / std, shape (\\*E, A)
+    :param max_kl: radius of the ball, reduced like the KL it bounds
+    :param reduction: "mean" or "sum" over action dimensions
+    :return: shape (\\*E, A)
+    """
+    summed_bound = max_kl * (offset.shape[-1] if reduction == "mean" else 1)
+    norm = offset.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+    return offset * (math.sqrt(2 * summed_bound) / norm).clamp(max=1.0)

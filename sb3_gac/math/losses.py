@@ -1,0 +1,163 @@
+"""
+Every equation of Guided Actor-Critic as a pure function of tensors.
+
+=====================  ==========================================================  ===========
+symbol                 meaning                                                     shape
+=====================  ==========================================================  ===========
+s                      privileged view: every entry of the observation             (\\*E, S)
+o                      partial view: what the learner sees                         (\\*E, P)
+mu, ``guider``         policy on s, collects the data                              --
+pi, ``learner``        policy on o, the one that is deployed                       --
+Q_theta                guided critics, on s                                        (N, \\*E)
+Q_phi                  learner critics, on s                                       (N, \\*E)
+alpha, ``kl_coef``     weight of KL(mu || pi), dual variable of KL <= target_kl    ()
+beta, ``ent_coef``     entropy temperature, dual variable of the entropy bound     ()
+=====================  ==========================================================  ===========
+
+``*E`` is any number of leading batch dimensions, (B,) for one-step batches and (T, B) for sequences.  An optional
+``mask`` of that shape (1 valid, 0 padding) leaves padding out of every average.  Equation numbers are those of the
+Guided Actor-Critic paper.  Whatever must not receive a gradient (targets, frozen critics, the other policy) is
+detached by the caller, except in the dual loss, whose violation is always a constant.
+"""
+
+import torch as th
+import torch.nn.functional as F
+
+
+def masked_mean(values: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
+    """
+    Average over all leading dimensions, padding left out.
+
+    :param values: shape (\\*E)
+    :param mask: shape (\\*E), 1 for valid entries and 0 for padding; ``None`` if all are valid
+    :return: scalar
+    """
+    if mask is None:
+        return values.mean()
+    return th.where(mask > 0, values, th.zeros_like(values)).sum() / mask.sum().clamp(min=1)
+
+
+def soft_target(
+    *,
+    reward: th.Tensor,
+    done: th.Tensor,
+    next_q: th.Tensor,
+    discount: th.Tensor | float,
+    next_log_prob: th.Tensor | float = 0.0,
+    ent_coef: th.Tensor | float = 0.0,
+    next_kl: th.Tensor | float = 0.0,
+    kl_coef: th.Tensor | float = 0.0,
+) -> th.Tensor:
+    """
+    Bellman target of a policy's critics: the return of eq. 15, with SAC's entropy term and eq. 12's KL term on request.
+
+    The expectation over a' of log mu - log pi in eq. 12 is the KL divergence itself, so its closed form replaces the sampled
+    ratio of the printed equation: less variance, never negative.
+
+    :param reward: shape (\\*E)
+    :param done: 1 where the episode terminated (a time limit is not a termination), shape (\\*E)
+    :param next_q: target critics at (s', a'), a' from the policy, shape (N, \\*E)
+    :param discount: gamma, or gamma to the number of steps between s and s', scalar or (\\*E)
+    :param next_log_prob: log-probability of a', shape (\\*E)
+    :param ent_coef: beta
+    :param next_kl: KL(mu(.|s') || pi(.|o')), shape (\\*E)
+    :param kl_coef: alpha
+    :return: shape (\\*E)
+    :raises ValueError: naming the tensor whose shape is not (\\*E)
+    """
+    _check_shapes(next_q.shape[1:], reward=reward, done=done, discount=discount, next_log_prob=next_log_prob, next_kl=next_kl)
+    next_value = next_q.amin(dim=0) - kl_coef * next_kl - ent_coef * next_log_prob
+    return reward + discount * (1 - done) * next_value
+
+
+def critic_loss(q: th.Tensor, target: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
+    """
+    Squared Bellman residual of an ensemble (eqs. 12 and 15): half the mean square, summed over the critics.
+
+    :param q: shape (N, \\*E)
+    :param target: shape (\\*E), detached
+    :param mask: shape (\\*E)
+    :return: scalar
+    """
+    if mask is None:
+        return 0.5 * len(q) * F.mse_loss(q, target.expand_as(q))
+    return 0.5 * masked_mean((q - target).square().sum(dim=0), mask)
+
+
+def policy_loss(
+    *,
+    q: th.Tensor,
+    log_prob: th.Tensor | float = 0.0,
+    ent_coef: th.Tensor | float = 0.0,
+    kl: th.Tensor | float = 0.0,
+    kl_coef: th.Tensor | float = 0.0,
+    mask: th.Tensor | None = None,
+) -> th.Tensor:
+    """
+    A policy's objective: climb its critics, with SAC's entropy term and a KL term on request. It is the guider's (eq. 13)
+    with KL(mu || sg pi), and the learner's (eq. 16) with KL(sg mu || pi).
+
+    :param q: critics at (s, a), a from the policy and reparameterised, frozen, shape (N, \\*E)
+    :param log_prob: log-probability of a, shape (\\*E)
+    :param ent_coef: beta
+    :param kl: divergence of the two policies, shape (\\*E)
+    :param kl_coef: alpha
+    :param mask: shape (\\*E)
+    :return: scalar
+    :raises ValueError: naming the tensor whose shape is not (\\*E)
+    """
+    _check_shapes(q.shape[1:], log_prob=log_prob, kl=kl, mask=mask)
+    return masked_mean(kl_coef * kl + ent_coef * log_prob - q.amin(dim=0), mask)
+
+
+def distillation_loss(kl: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
+    """
+    Learner objective without reinforcement learning (eq. 14).
+
+    :param kl: KL(sg mu || pi), shape (\\*E)
+    :param mask: shape (\\*E)
+    :return: scalar
+    """
+    return masked_mean(kl, mask)
+
+
+def log_std_loss(log_std: th.Tensor, guider_log_std: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
+    """
+    Fit of the learner's own log standard deviation, used at deployment only, to the guider's.
+
+    :param log_std: shape (\\*E, A)
+    :param guider_log_std: shape (\\*E, A), detached
+    :param mask: shape (\\*E)
+    :return: scalar
+    """
+    return 0.5 * masked_mean((log_std - guider_log_std).square().mean(dim=-1), mask)
+
+
+def dual_loss(log_coef: th.Tensor, violation: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
+    """
+    Loss of a dual variable in log space; its coefficient rises exactly while the constraint is violated.
+
+    For alpha (eq. 17, with the sign its text describes) the violation is KL - target_kl; for SAC's beta it is
+    log mu + target_entropy.
+
+    :param log_coef: logarithm of the coefficient, shape () or (1,)
+    :param violation: shape (\\*E); treated as a constant
+    :param mask: shape (\\*E)
+    :return: scalar
+    """
+    return -(log_coef.exp() * masked_mean(violation.detach(), mask)).sum()
+
+
+def _check_shapes(expected: th.Size, **tensors: th.Tensor | float | None) -> None:
+    """
+    Broadcasting would make a wrong shape a wrong number.
+
+    :param expected: of all tensors but scalars
+    :param tensors: name -> tensor, or a number
+    :raises ValueError: naming the one that has another shape
+    """
+    for name, tensor in tensors.items():
+        if isinstance(tensor, th.Tensor) and tensor.dim() > 0 and tensor.shape != expected:
+            raise ValueError(
+                f"{name} must have the shape {tuple(expected)}, as the critics' values have, got {tuple(tensor.shape)}."
+            )

@@ -1,0 +1,81 @@
+"""Modules under the names of earlier versions, for one release: in saved models, checkpoints and users' imports."""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+#: Former name -> present name
+MOVED = {
+    f"sb3_gac.{former}": f"sb3_gac.{present}"
+    for former, present in {
+        "common.actors": "networks.actors",
+        "common.arguments": "checks.arguments",
+        "common.buffers": "replay.buffer",
+        "common.callbacks": "base.callbacks",
+        "common.checkpoint_callback": "base.checkpoint_callback",
+        "common.checkpoint_files": "checkpoint.files",
+        "common.checks": "checks.values",
+        "common.compilation": "optim.compile",
+        "common.distributions": "math.distributions",
+        "common.divergence": "checks.divergence",
+        "common.dual": "optim.coefficients",
+        "common.env_guard": "checks.environments",
+        "common.episodes": "replay.episodes",
+        "common.faults": "base.faults",
+        "common.flat": "optim.flat",
+        "common.graphs": "optim.graphs",
+        "common.guard": "base.strict_predict",
+        "common.heads": "networks.heads",
+        "common.losses": "math.losses",
+        "common.memory": "networks.recurrent",
+        "common.networks": "networks.critics",
+        "common.normalization": "deploy.normalization",
+        "common.observation_store": "replay.observation_store",
+        "common.off_policy": "base.off_policy",
+        "common.parallel": "optim.parallel",
+        "common.policies": "base.policy",
+        "common.resuming": "base.resuming",
+        "common.roles": "base.roles",
+        "common.serialization": "checkpoint.serialization",
+        "common.training": "base.update",
+        "common.vec_state": "checkpoint.vec_env",
+        "export": "deploy.export",
+        "verification": "deploy.verification",
+    }.items()
+}
+PACKAGE = "sb3_gac.common"
+
+
+class MovedModules(MetaPathFinder, Loader):
+    """Finds a module under its former name, and says what its name is now."""
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        """
+        :param fullname: of a module that nobody else has found
+        :param path: of its package
+        :param target: not needed
+        :return: ``None`` unless this is a former name
+        """
+        if fullname not in MOVED and fullname != PACKAGE:
+            return None
+        return ModuleSpec(fullname, self, is_package=fullname == PACKAGE)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """
+        :param module: gets what is in the module of the present name, the same objects
+        """
+        if module.__name__ in MOVED:
+            present = MOVED[module.__name__]
+            warnings.warn(f"{module.__name__} is {present} now.", DeprecationWarning, stacklevel=2)
+            names = {name: value for name, value in vars(import_module(present)).items() if not name.startswith("__")}
+            vars(module).update(names)
+
+
+def find_moved_modules() -> None:
+    """Take former names for present ones from now on."""
+    if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
+        sys.meta_path.append(MovedModules())

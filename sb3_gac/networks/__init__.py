@@ -1,0 +1,1 @@
+"""What is between observations and numbers: encoders, memories, heads, critics, policy networks."""

@@ -1,0 +1,211 @@
+"""Policy networks on the entries of one role: the base of all, and of those that are deployed."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_gac.checks.entries import ObservationReader, check_is_observation
+from sb3_gac.math.distributions import Distribution
+from sb3_gac.networks.heads import LOG_STD_BOUNDS, make_head
+from sb3_gac.networks.role_model import RoleModel
+
+
+class BoundedPolicy(BasePolicy):
+    """A policy whose actions, scaled to the environment's range, stay in it."""
+
+    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
+        """
+        See SB3's ``unscale_action``; here rounding does not lead beyond the upper bound.
+
+        :param scaled_action: in [-1, 1], shape (..., \\*action shape)
+        :return: in the environment's range
+        """
+        return np.minimum(super().unscale_action(scaled_action), self.action_space.high)  # type: ignore[attr-defined]
+
+
+class RolePolicy(RoleModel, BoundedPolicy):
+    """
+    A policy network on the entries of its role: encoder, hidden layers, and the head that fits the actions.
+
+    :param observation_space: the entries that this role reads
+    :param action_space: Box or Discrete
+    :param net_arch: hidden layer sizes
+    :param features_extractor: encoder of the entries
+    :param features_dim: its output size
+    :param activation_fn: between layers
+    :param normalize_images: divide images by 255
+    :param rest_extractor: encoder of the entries that the deployed policy does not read, if
+        ``features_extractor`` is the deployed policy's and this is another role
+    :param log_std_bounds: smallest and largest log standard deviation before tanh
+    :param memory: of the entries, for sequences; ``features_dim`` is then its output size
+    """
+
+    features_extractor: BaseFeaturesExtractor
+    head: Any  # GaussianHead or CategoricalHead, which nn.Module hides from type checkers
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        normalize_images: bool = True,
+        rest_extractor: BaseFeaturesExtractor | None = None,
+        log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
+        memory: nn.Module | None = None,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=isinstance(action_space, spaces.Box),
+        )
+        self.reader = ObservationReader(observation_space)
+        self.rest_extractor = rest_extractor
+        self.memory = memory
+        self.net_arch = net_arch
+        self.features_dim = features_dim
+        self.activation_fn = activation_fn
+        self.log_std_bounds = log_std_bounds
+        self.latent_net = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
+        latent_dim = net_arch[-1] if net_arch else features_dim
+        self.head = make_head(latent_dim, action_space, log_std_bounds)
+
+    def forward(self, obs: PyTorchObs) -> Distribution:
+        """See :meth:`distribution`."""
+        return self.distribution(obs)
+
+    def distribution(self, obs: PyTorchObs) -> Distribution:
+        r"""
+        What the network computes; with a memory, of sequences from an episode's start on.
+
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :return: distribution of actions, or of what makes them, shapes (\*E, A)
+        """
+        return self.output(self.latent(obs))
+
+    def latent(self, obs: PyTorchObs) -> th.Tensor:
+        r"""
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :return: last hidden layer, shape (\*E, H)
+        """
+        features = self.extract_features(obs, self.features_extractor)
+        return self.latent_net(features if self.memory is None else self.memory(features)[0][0])
+
+    def output(self, latent: th.Tensor) -> Distribution:
+        r"""
+        :param latent: shape (\*E, H)
+        :return: see :meth:`distribution`
+        """
+        return self.head(latent)
+
+    def remember(
+        self, obs: PyTorchObs, state: np.ndarray | None, episode_start: np.ndarray | None
+    ) -> tuple[Distribution, np.ndarray | None]:
+        """
+        One step of acting.
+
+        :param obs: observation with at least the entries of this role, (B, ...) of each
+        :param state: what was remembered before, shape (B, S), or ``None``
+        :param episode_start: true where an episode starts, shape (B,)
+        :return: as of :meth:`distribution`, shapes (B, A), and what is remembered now; ``None`` without a memory
+        """
+        if self.memory is None:
+            return self.distribution(obs), None
+        assert isinstance(obs, dict)
+        one_step = {key: value[None] for key, value in obs.items()}
+        features = self.extract_features(one_step, self.features_extractor)
+        before = self.memory.state_before(state, episode_start, features.shape[1])  # type: ignore[operator]
+        outputs, after = self.memory(features, before)
+        return self.output(self.latent_net(outputs[0, 0])), after[0].detach().cpu().numpy()
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {
+            "net_arch": self.net_arch,
+            "features_extractor": self.features_extractor,
+            "features_dim": self.features_dim,
+            "activation_fn": self.activation_fn,
+            "rest_extractor": self.rest_extractor,
+            "log_std_bounds": self.log_std_bounds,
+            "memory": self.memory,
+        }
+
+
+class DeployedPolicy(RolePolicy):
+    """The policy that ``predict`` stands for: it needs its own entries and ignores all others."""
+
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """
+        :param observation: single or batched; a dict with at least the policy's entries, or, where the policy
+            reads one entry, that entry alone
+        :return: tensors of the policy's entries, and whether they were batched
+        :raises ValueError: naming the entry that is missing, does not fit its space, or is not as many as the others
+        """
+        return self.reader.read(self._own_entries(observation), self.device)
+
+    def _own_entries(self, observation: np.ndarray | dict[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        assert isinstance(self.observation_space, spaces.Dict)
+        keys = list(self.observation_space.spaces)
+        check_is_observation(observation)
+        if not isinstance(observation, Mapping):
+            if len(keys) > 1:
+                raise ValueError(f"The policy reads {keys}: pass predict() a dict with these entries, not an array.")
+            return {keys[0]: observation}
+        missing = [key for key in keys if key not in observation]
+        if missing:
+            raise ValueError(f"The observation passed to predict() lacks {missing}, which the policy reads.")
+        return observation
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        :param observation: see :meth:`obs_to_tensor`
+        :param state: what the last call returned, ``None`` at the start
+        :param episode_start: true where an episode starts, shape (B,)
+        :param deterministic: mode instead of a sample
+        :return: action in the environment's range, and the state for the next call
+        """
+        if self.memory is None:
+            return super().predict(observation, state, episode_start, deterministic)
+        self.set_training_mode(False)
+        obs, vectorized = self.obs_to_tensor(observation)
+        with th.no_grad():
+            actions, after = self.remember(obs, None if state is None else state[0], episode_start)
+        chosen = actions.mode if deterministic else actions.sample()
+        action = chosen.cpu().numpy().reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+        if isinstance(self.action_space, spaces.Box):
+            action = self.unscale_action(action)
+        assert after is not None
+        return (action if vectorized else action.squeeze(axis=0)), (after,)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        actions, _ = self.remember(observation, None, None)
+        return actions.mode if deterministic else actions.sample()
+
+
+class Actor(DeployedPolicy):
+    """A deployed policy that returns actions when it is called, as the actor of SB3's SAC does."""
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:  # type: ignore[override]
+        """
+        :param obs: observation with at least the policy's entries, (B, ...) of each; for a policy with a memory, those of
+            an episode's first step
+        :param deterministic: mode instead of a sample, which is differentiable where actions are continuous
+        :return: actions in [-1, 1], shape (B, A), or numbers of actions, shape (B,)
+        """
+        return self._predict(obs, deterministic)

@@ -1,0 +1,149 @@
+"""Q-networks on the entries of one role: an ensemble evaluated at once, of given actions or of all."""
+
+import itertools
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_gac.networks.layers import EnsembleHead, EnsembleInput, EnsembleLinear, EnsembleOutput
+from sb3_gac.networks.role_model import RoleModel
+
+
+class CriticEnsemble(RoleModel):
+    """
+    Q-networks on the entries of one role, evaluated together: of actions that they are given.
+
+    :param observation_space: the entries that this role reads
+    :param action_space: Box
+    :param net_arch: hidden layer sizes
+    :param features_extractor: encoder of the entries
+    :param features_dim: its output size, F
+    :param activation_fn: between layers
+    :param normalize_images: divide images by 255
+    :param rest_extractor: encoder of the entries that the learner does not read, if ``features_extractor`` is the
+        learner's
+    :param n_critics: size of the ensemble, N
+    :param memory: of the entries, for sequences; ``features_dim`` is then its output size. Actions join after it
+    """
+
+    features_extractor: BaseFeaturesExtractor
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        normalize_images: bool = True,
+        rest_extractor: BaseFeaturesExtractor | None = None,
+        n_critics: int = 2,
+        memory: nn.Module | None = None,
+    ):
+        super().__init__(
+            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+        )
+        self.rest_extractor = rest_extractor
+        self.memory = memory
+        self.net_arch = net_arch
+        self.features_dim = features_dim
+        self.activation_fn = activation_fn
+        self.n_critics = n_critics
+        layers = [activation_fn()] if net_arch else []
+        for in_features, out_features in itertools.pairwise(net_arch):
+            layers += [EnsembleLinear(n_critics, in_features, out_features), activation_fn()]
+        self.hidden = nn.Sequential(*layers)
+        self._make_ends(features_dim)
+
+    def _make_ends(self, features_dim: int) -> None:
+        """First and last layer."""
+        action_dim = get_action_dim(self.action_space)
+        self.input: nn.Module | None = None
+        if self.net_arch:
+            self.input = EnsembleInput(self.n_critics, features_dim, action_dim, self.net_arch[0])
+        self.output: nn.Module = EnsembleOutput(self.n_critics, [features_dim + action_dim, *self.net_arch][-1])
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor | None) -> th.Tensor:
+        r"""
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :param actions: in [-1, 1], shape (\*E, A)
+        :return: shape (N, \*E)
+        """
+        return self.values(self.encode(obs), actions)
+
+    def encode(self, obs: PyTorchObs) -> th.Tensor:
+        r"""
+        What is needed of the observations, whatever the actions.
+
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :return: shape (B, F), or with a memory (N, T, B, F)
+        """
+        features = self.extract_features(obs, self.features_extractor)
+        return features if self.memory is None else self.memory(features)[0]
+
+    def values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
+        """
+        :param features: of :meth:`encode`
+        :param actions: see :meth:`forward`
+        :return: see :meth:`forward`
+        """
+        if self.memory is None:
+            return self._values(features.expand(self.n_critics, *features.shape), actions)
+        assert actions is None or actions.dim() == 3
+        flat_actions = None if actions is None else actions.flatten(0, 1)
+        return self._values(features.flatten(1, 2), flat_actions).unflatten(1, features.shape[1:3])
+
+    def _values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
+        """
+        :param features: shape (N, B, F)
+        :param actions: shape (B, A)
+        :return: shape (N, B)
+        """
+        assert actions is not None
+        if self.input is None:
+            return self.output(th.cat([features, actions.expand(self.n_critics, *actions.shape)], dim=-1))
+        return self.output(self.hidden(self.input(features, actions)))
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {
+            "net_arch": self.net_arch,
+            "features_extractor": self.features_extractor,
+            "features_dim": self.features_dim,
+            "activation_fn": self.activation_fn,
+            "rest_extractor": self.rest_extractor,
+            "n_critics": self.n_critics,
+            "memory": self.memory,
+        }
+
+
+class DiscreteCriticEnsemble(CriticEnsemble):
+    """
+    Q-networks with a value for every action.
+
+    Arguments are those of :class:`CriticEnsemble`, but for ``action_space``: Discrete, of A actions.
+    """
+
+    def _make_ends(self, features_dim: int) -> None:
+        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+        widths = [features_dim, *self.net_arch]
+        self.input = EnsembleLinear(self.n_critics, features_dim, widths[1]) if self.net_arch else None
+        self.output = EnsembleHead(self.n_critics, widths[-1], n_actions)
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor:
+        r"""
+        :param obs: observation with at least the entries of this role, (\*E, ...) of each
+        :param actions: numbers of actions, shape (\*E, 1); ``None`` for all
+        :return: shape (N, \*E), or (N, \*E, A) of all actions
+        """
+        return super().forward(obs, actions)
+
+    def _values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
+        x = features if self.input is None else self.hidden(self.input(features))
+        q = self.output(x)
+        return q if actions is None else q.gather(-1, actions.long().expand(self.n_critics, *actions.shape)).squeeze(-1)

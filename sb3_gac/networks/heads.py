@@ -1,0 +1,169 @@
+"""
+What a policy network ends with, by action space: a tanh-Gaussian for Box, a categorical distribution for Discrete.
+
+All that depends on the kind of action is here, in :mod:`sb3_gac.math.distributions`, and in the two critic ensembles.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+from sb3_gac.checks.values import UnsupportedActionSpaceError, check_box_actions, check_range
+from sb3_gac.math.distributions import Categorical, TanhGaussian
+from sb3_gac.math.losses import log_std_loss
+from sb3_gac.networks.layers import Head
+
+LOG_STD_BOUNDS = (-5.0, 1.0)
+
+
+class GaussianHead(nn.Module):
+    """
+    Mean and log standard deviation before tanh.
+
+    :param latent_dim: H
+    :param action_space: of A dimensions
+    :param log_std_bounds: smallest and largest log standard deviation before tanh
+    """
+
+    def __init__(self, latent_dim: int, action_space: spaces.Box, log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS):
+        super().__init__()
+        action_dim = spaces.flatdim(action_space)
+        self.mean = Head(latent_dim, action_dim)
+        self.log_std = Head(latent_dim, action_dim)
+        self.log_std_bounds = log_std_bounds
+
+    def forward(self, latent: th.Tensor, detach_std: bool = False) -> TanhGaussian:
+        """
+        :param latent: shape (\\*E, H)
+        :param detach_std: whether the standard deviation's gradient stops at its own layer
+        :return: shapes (\\*E, A)
+        """
+        log_std = self.log_std(latent.detach() if detach_std else latent)
+        return TanhGaussian(self.mean(latent), log_std.clamp(*self.log_std_bounds))
+
+    def deployment_parameters(self) -> list[nn.Parameter]:
+        """Those that serve at deployment only, if the standard deviation of training is the guider's."""
+        return list(self.log_std.parameters())
+
+    @staticmethod
+    def deployment_losses(
+        deployed: TanhGaussian, borrowing: TanhGaussian, mask: th.Tensor | None = None
+    ) -> dict[str, th.Tensor]:
+        """
+        :param deployed: the learner with its own standard deviation, shapes (\\*E, A)
+        :param borrowing: with the guider's, as a constant, shapes (\\*E, A)
+        :param mask: shape (\\*E)
+        :return: name -> scalar, what :meth:`deployment_parameters` are fitted with
+        """
+        return {"log_std_loss": log_std_loss(deployed.log_std, borrowing.log_std, mask)}
+
+    @th.no_grad()
+    def shrink(self, factor: float) -> None:
+        """
+        :param factor: of the mean's weights and biases
+        """
+        self.mean.weight.mul_(factor)
+        self.mean.bias.mul_(factor)
+
+
+class CategoricalHead(nn.Module):
+    """
+    Unnormalised log-probabilities.
+
+    :param latent_dim: H
+    :param action_space: of A actions
+    """
+
+    def __init__(self, latent_dim: int, action_space: spaces.Discrete):
+        super().__init__()
+        self.logits = Head(latent_dim, int(action_space.n))
+
+    def forward(self, latent: th.Tensor, detach_std: bool = False) -> Categorical:
+        """
+        :param latent: shape (\\*E, H)
+        :param detach_std: there is none
+        :return: shape (\\*E, A)
+        """
+        return Categorical(self.logits(latent))
+
+    def deployment_parameters(self) -> list[nn.Parameter]:
+        """None: the learner is itself, with a guider and without."""
+        return []
+
+    @staticmethod
+    def deployment_losses(
+        deployed: Categorical, borrowing: Categorical, mask: th.Tensor | None = None
+    ) -> dict[str, th.Tensor]:
+        """None."""
+        return {}
+
+    @th.no_grad()
+    def shrink(self, factor: float) -> None:
+        """
+        :param factor: of weights and biases
+        """
+        self.logits.weight.mul_(factor)
+        self.logits.bias.mul_(factor)
+
+
+def make_head(latent_dim: int, action_space: spaces.Space, log_std_bounds: tuple[float, float]) -> nn.Module:
+    """
+    :param latent_dim: H
+    :param action_space: Box or Discrete
+    :param log_std_bounds: for Box
+    """
+    if isinstance(action_space, spaces.Discrete):
+        return CategoricalHead(latent_dim, action_space)
+    assert isinstance(action_space, spaces.Box)
+    check_range("log_std_bounds", log_std_bounds)
+    return GaussianHead(latent_dim, action_space, log_std_bounds)
+
+
+def check_action_space(algorithm: str, action_space: spaces.Space) -> None:
+    """
+    :param algorithm: for the message
+    :param action_space: of the environment
+    :raises UnsupportedActionSpaceError: if there is no head for it
+    """
+    if isinstance(action_space, spaces.Box):
+        check_box_actions(action_space)
+        return
+    if isinstance(action_space, spaces.Discrete) and action_space.start == 0:
+        return
+    remedy = {
+        spaces.MultiDiscrete: "Wrap the environment in sb3_gac.envs.FlattenMultiDiscrete, which numbers the combinations.",
+        spaces.MultiBinary: "Wrap the environment so that its actions are MultiDiscrete, and that in "
+        "sb3_gac.envs.FlattenMultiDiscrete.",
+        spaces.Discrete: "Wrap the environment so that its actions count from 0.",
+    }.get(type(action_space), "Wrap the environment so that its actions are continuous, or one of a number of choices.")
+    raise UnsupportedActionSpaceError(
+        f"{algorithm} supports Box and Discrete action spaces, but the environment has {action_space}. {remedy}"
+    )
+
+
+def resolve_target_entropy(target_entropy: Any, action_space: spaces.Space) -> float:
+    """
+    :param target_entropy: a number; "auto", the paper's: -0.5 per dimension, or 0.9 of a uniform choice's; "sac", SAC's: -1
+        per dimension, or 0.98 of a uniform choice's (arXiv 1910.07207)
+    :param action_space: Box or Discrete
+    :return: entropy in nats
+    :raises ValueError: if it is none of these
+    """
+    if isinstance(action_space, spaces.Discrete):
+        named = {name: share * math.log(action_space.n) for name, share in (("auto", 0.9), ("sac", 0.98))}
+    else:
+        assert action_space.shape is not None
+        named = {name: share * float(np.prod(action_space.shape)) for name, share in (("auto", -0.5), ("sac", -1.0))}
+    if isinstance(target_entropy, str) and target_entropy in named:
+        return named[target_entropy]
+    try:
+        number = float(target_entropy)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f'target_entropy must be "auto", "sac" or a number, got {target_entropy!r}.')
+    return number

@@ -1,0 +1,113 @@
+"""Layers of networks: last ones in float32, and those of an ensemble in one product."""
+
+from collections.abc import Callable
+
+import torch as th
+from torch import nn
+
+
+def in_float32(layer: Callable[[th.Tensor], th.Tensor], x: th.Tensor) -> th.Tensor:
+    """
+    :param layer: one that stays in float32 where the layers before it are in mixed precision
+    :param x: its input
+    :return: its output
+    """
+    if not th.is_autocast_enabled(x.device.type):
+        return layer(x)
+    with th.autocast(x.device.type, enabled=False):
+        return layer(x.float())
+
+
+class Head(nn.Linear):
+    """A last layer, in float32."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: shape (B, F)
+        :return: shape (B, H)
+        """
+        return in_float32(super().forward, x)
+
+
+class EnsembleLinear(nn.Module):
+    """
+    ``n_members`` linear layers in one batched product, each initialised like ``torch.nn.Linear``.
+
+    :param n_members: size of the ensemble, N
+    :param in_features: F
+    :param out_features: H
+    """
+
+    def __init__(self, n_members: int, in_features: int, out_features: int):
+        super().__init__()
+        bound = in_features**-0.5
+        self.weight = nn.Parameter(th.empty(n_members, in_features, out_features).uniform_(-bound, bound))
+        self.bias = nn.Parameter(th.empty(n_members, 1, out_features).uniform_(-bound, bound))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: shape (N, B, F)
+        :return: shape (N, B, H)
+        """
+        return th.bmm(x, self.weight) + self.bias
+
+
+class EnsembleHead(EnsembleLinear):
+    """Last layers of an ensemble, in float32."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: shape (N, B, F)
+        :return: shape (N, B, H)
+        """
+        return in_float32(super().forward, x)
+
+
+class EnsembleInput(nn.Module):
+    """
+    First layer of an ensemble, with separate weights for features and actions: where only the actions have a gradient,
+    as in a policy's loss, only theirs is computed.
+
+    :param n_members: size of the ensemble, N
+    :param features_dim: F
+    :param action_dim: A
+    :param out_features: H
+    """
+
+    def __init__(self, n_members: int, features_dim: int, action_dim: int, out_features: int):
+        super().__init__()
+        layer = EnsembleLinear(n_members, features_dim + action_dim, out_features)
+        self.features_weight = nn.Parameter(layer.weight.detach()[:, :features_dim].clone())
+        self.actions_weight = nn.Parameter(layer.weight.detach()[:, features_dim:].clone())
+        self.bias = layer.bias
+
+    def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        :param features: shape (N, B, F)
+        :param actions: shape (B, A)
+        :return: shape (N, B, H)
+        """
+        x = th.bmm(features, self.features_weight)
+        return th.baddbmm(x, actions.expand(len(features), *actions.shape), self.actions_weight) + self.bias
+
+
+class EnsembleOutput(nn.Module):
+    """
+    Last layer of an ensemble, one value each: a product and a sum, several times faster than so thin a matrix product.
+
+    :param n_members: size of the ensemble, N
+    :param in_features: H
+    """
+
+    def __init__(self, n_members: int, in_features: int):
+        super().__init__()
+        layer = EnsembleLinear(n_members, in_features, 1)
+        self.weight = nn.Parameter(layer.weight.detach().transpose(1, 2).clone())
+        self.bias = nn.Parameter(layer.bias.detach()[:, 0].clone())
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: shape (N, B, H)
+        :return: shape (N, B)
+        """
+        return (x * self.weight).sum(dim=-1) + self.bias

@@ -1,0 +1,51 @@
+"""The base of networks that read the observation entries of their role."""
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_gac.checks.entries import encode
+from sb3_gac.networks.encoders import VectorExtractor
+
+
+class RoleModel(BaseModel):
+    """
+    A network that reads only the observation entries of its role, whatever else the observation holds.
+
+    With a ``memory`` (:class:`sb3_gac.networks.recurrent.Memory`) it takes sequences from an episode's start on, (T, B, ...)
+    of each entry instead of (B, ...).
+
+    Where the learner's encoder is shared, ``features_extractor`` is the learner's, which the learner's loss alone
+    trains, and ``rest_extractor`` encodes the entries that the learner does not read.
+    """
+
+    rest_extractor: BaseFeaturesExtractor | None
+    memory: nn.Module | None
+
+    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
+        """
+        :param obs: observation with at least the entries of this role
+        :param features_extractor: the role's extractor, or the learner's
+        :return: shape (B, F)
+        """
+        if self.rest_extractor is None:
+            return self._encode(obs, self.observation_space, features_extractor)
+        with th.no_grad():
+            shared = self._encode(obs, features_extractor._observation_space, features_extractor)
+        return th.cat([shared, self._encode(obs, self.rest_extractor._observation_space, self.rest_extractor)], dim=-1)
+
+    def _encode(self, obs: PyTorchObs, space: spaces.Space, extractor: BaseFeaturesExtractor) -> th.Tensor:
+        assert isinstance(space, spaces.Dict)
+        if isinstance(extractor, VectorExtractor):
+            return extractor(obs)
+        entries = {key: obs[key] for key in space.spaces}  # type: ignore[index]
+        leading: list[int] = []
+        if self.memory is not None:  # encoders know one leading dimension, sequences have two
+            leading = list(next(iter(entries.values())).shape[:2])
+            entries = {key: value.flatten(0, 1) for key, value in entries.items()}
+        features = extractor({key: encode(value, space[key], self.normalize_images) for key, value in entries.items()})
+        # not unflatten, which ONNX would do for the example's batch alone
+        return features.reshape(*leading, -1) if leading else features

@@ -1,0 +1,1 @@
+"""How networks and coefficients are moved: flat parameters, optimisers, duals, compilation, threads."""

@@ -1,0 +1,292 @@
+"""A replay buffer for dict observations that stores each observation once."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import psutil
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_gac.checks.entries import computable
+from sb3_gac.replay.observation_store import FinalObservations, ObservationLayout, Rows
+
+DONE, TIME_LIMIT, CUT = 1, 2, 4
+
+
+class CompactDictReplayBuffer(DictReplayBuffer):
+    """
+    A ring of observations: the next observation of a step is the observation of the following one.
+
+    Only where an episode ends, or the environment was reset from outside, is a final observation kept apart.  One row
+    more than the capacity holds the newest next observation.  Exact for terminations, time limits and several
+    environments, and drops in for SB3's ``DictReplayBuffer``, which stores every observation twice.
+
+    :param buffer_size: transitions kept, over all environments
+    :param observation_space: Dict
+    :param action_space: of the environments
+    :param device: of the samples
+    :param n_envs: number of environments
+    :param optimize_memory_usage: accepted, always so
+    :param handle_timeout_termination: whether a time limit bootstraps, instead of counting as termination
+    :param n_steps: rewards summed up in a sample; it ends early where the episode or the data do
+    :param gamma: discount factor of that sum
+    :param storage_dtype: "float16" to store floating-point entries at half precision
+    :raises MemoryError: if the buffer can't fit into the memory that is available
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = True,
+        handle_timeout_termination: bool = True,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        storage_dtype: str | None = None,
+    ):
+        super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
+        if n_steps < 1:
+            raise ValueError(f"n_steps must be at least 1, got {n_steps}.")
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.optimize_memory_usage = optimize_memory_usage
+        self.handle_timeout_termination = handle_timeout_termination
+        self.n_steps = n_steps
+        self.gamma = gamma
+        self.layout = ObservationLayout(observation_space, None if storage_dtype is None else np.dtype(storage_dtype))
+        self.n_rows = self.buffer_size + 1
+        action_dtype = np.dtype(self._maybe_cast_dtype(action_space.dtype))
+        self._check_memory(self.layout.row_bytes() + self.action_dim * action_dtype.itemsize + 5)
+        self._rows = self.layout.empty(self.n_rows, n_envs)
+        self._finals = FinalObservations(self.layout)
+        self.actions = np.zeros((self.n_rows, n_envs, self.action_dim), dtype=action_dtype)
+        self.rewards = np.zeros((self.n_rows, n_envs), dtype=np.float32)
+        self.endings = np.zeros((self.n_rows, n_envs), dtype=np.uint8)
+        self._n_added = 0
+
+    # --- what SB3's buffers show -------------------------------------------------------------------------------------
+
+    @property
+    def observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
+        """Entry -> shape (rows, n_envs, \\*entry shape); the row at ``pos`` is the newest next observation."""
+        return self.layout.unpack(self._rows)
+
+    @property
+    def next_observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
+        """Entry -> shape (rows, n_envs, \\*entry shape), put together for inspection."""
+        rows, envs = np.divmod(np.arange(self.n_rows * self.n_envs), self.n_envs)
+        following = self._next_rows(rows, envs, only_stored=True)
+        shaped = {group: values.reshape(self.n_rows, self.n_envs, -1) for group, values in following.items()}
+        return self.layout.unpack(shaped)
+
+    @property
+    def dones(self) -> np.ndarray:  # type: ignore[override]
+        """1 where an episode ended, for whatever reason, shape (rows, n_envs)."""
+        return (self.endings & DONE).astype(np.float32)
+
+    @property
+    def timeouts(self) -> np.ndarray:  # type: ignore[override]
+        """1 where it ended by its time limit, shape (rows, n_envs)."""
+        return (self.endings & TIME_LIMIT > 0).astype(np.float32)
+
+    def nbytes(self) -> int:
+        """Bytes allocated."""
+        arrays = [*self._rows.values(), self.actions, self.rewards, self.endings]
+        return sum(array.nbytes for array in arrays) + self._finals.nbytes()
+
+    def size(self) -> int:
+        """Transitions kept per environment."""
+        return min(self._n_added, self.buffer_size)
+
+    def reset(self) -> None:
+        """Forget everything."""
+        super().reset()
+        self._n_added = 0
+        self._finals = FinalObservations(self.layout)
+        self.endings[:] = 0
+
+    # --- checkpoints -------------------------------------------------------------------------------------------------
+
+    @property
+    def n_added(self) -> int:
+        """Transitions ever added, per environment."""
+        return self._n_added
+
+    def rows_by_name(self) -> dict[str, np.ndarray]:
+        """What the ring holds, by row: arrays of shape (rows, n_envs, \\*), not copied; a step writes its row and the next."""
+        return {**self._rows, "actions": self.actions, "rewards": self.rewards, "endings": self.endings}
+
+    def bookkeeping(self) -> dict[str, Any]:
+        """All else that there is, for :meth:`restore_bookkeeping`."""
+        return {"n_added": self._n_added, "shape": list(self.rewards.shape), "finals": self._finals.state()}
+
+    def restore_bookkeeping(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`bookkeeping`
+        :raises ValueError: if it is of a buffer of another size
+        """
+        if state["shape"] != list(self.rewards.shape):
+            raise ValueError(f"The buffer has (rows, environments) {list(self.rewards.shape)}, and had {state['shape']}.")
+        self._n_added = state["n_added"]
+        self.pos = self._n_added % self.n_rows
+        self.full = self._n_added >= self.buffer_size
+        self._finals.restore(state["finals"])
+
+    # --- adding ------------------------------------------------------------------------------------------------------
+
+    def add(  # type: ignore[override]
+        self,
+        obs: Mapping[str, np.ndarray],
+        next_obs: Mapping[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        :param obs: observations, one row per environment
+        :param next_obs: observations after the action; at an episode's end its last, not the next episode's first
+        :param action: shape (n_envs, \\*action shape)
+        :param reward: shape (n_envs,)
+        :param done: shape (n_envs,)
+        :param infos: with "TimeLimit.truncated" where a time limit ended the episode
+        :raises ValueError: naming the entry that does not fit, see :meth:`ObservationLayout.pack`; nothing is then stored
+        """
+        rows, next_rows = self.layout.pack(obs, self.n_envs), self.layout.pack(next_obs, self.n_envs)
+        self._finals.forget_from(self._n_added * self.n_envs)
+        if self._n_added:
+            self._cut_what_does_not_continue(rows)
+        for group, values in rows.items():
+            self._rows[group][self.pos] = values
+        self.actions[self.pos] = np.reshape(action, (self.n_envs, self.action_dim))
+        self.rewards[self.pos] = reward
+        self.endings[self.pos] = np.asarray(done, dtype=np.uint8) * DONE
+        if self.handle_timeout_termination:
+            by_time_limit = np.array([bool(info.get("TimeLimit.truncated", False)) for info in infos])
+            self.endings[self.pos] |= np.where(done, by_time_limit, False).astype(np.uint8) * np.uint8(TIME_LIMIT)
+        self._keep_finals(np.flatnonzero(self.endings[self.pos]), next_rows, self._n_added)
+
+        self._n_added += 1
+        self.pos = self._n_added % self.n_rows
+        self.full = self._n_added >= self.buffer_size
+        for group, values in next_rows.items():
+            self._rows[group][self.pos] = values
+        self._finals.forget_before((self._n_added - self.size()) * self.n_envs)
+
+    def cut(self) -> None:
+        """Whoever resets the environments from outside says so: what was added last is not continued by what comes next."""
+        if self._n_added:
+            self._cut(np.ones(self.n_envs, dtype=bool))
+
+    def _cut_what_does_not_continue(self, rows: Rows) -> None:
+        """Where an episode goes on from another observation than it reached, someone did not say so."""
+        self._cut(np.any([np.any(rows[group] != values[self.pos], axis=1) for group, values in self._rows.items()], axis=0))
+
+    def _cut(self, envs: np.ndarray) -> None:
+        """
+        :param envs: whether to cut what was added last, unless it ends an episode anyway, shape (n_envs,)
+        """
+        previous = (self._n_added - 1) % self.n_rows
+        cut = np.flatnonzero(envs & (self.endings[previous] == 0))
+        self.endings[previous, cut] = CUT
+        self._keep_finals(cut, {group: values[self.pos] for group, values in self._rows.items()}, self._n_added - 1)
+
+    def _keep_finals(self, envs: np.ndarray, rows: Rows, step: int) -> None:
+        if len(envs):
+            self._finals.append(step * self.n_envs + envs, {group: values[envs] for group, values in rows.items()})
+
+    # --- sampling ----------------------------------------------------------------------------------------------------
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> DictReplayBufferSamples:  # type: ignore[override]
+        """
+        :param batch_size: transitions, drawn uniformly with replacement, B
+        :param env: normalises observations and rewards
+        :return: tensors on the buffer's device, (B, ...) each
+        """
+        steps = np.random.randint(self._n_added - self.size(), self._n_added, size=batch_size)
+        return self._get_samples(steps % self.n_rows, env)
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        envs = np.random.randint(self.n_envs, size=len(batch_inds))
+        rewards, last, discounts = self._n_step_rewards(batch_inds, envs, env)
+        endings = self.endings[last, envs]
+        terminated = (endings & (DONE | TIME_LIMIT)) == DONE
+        return DictReplayBufferSamples(
+            observations=self._to_tensors(self._gather(batch_inds, envs), env),
+            actions=self.to_torch(self.actions[batch_inds, envs], copy=False),
+            next_observations=self._to_tensors(self._next_rows(last, envs), env),
+            dones=self.to_torch(terminated.astype(np.float32)[:, None], copy=False),
+            rewards=self.to_torch(rewards[:, None], copy=False),
+            discounts=None if discounts is None else self.to_torch(discounts[:, None], copy=False),
+        )
+
+    def _n_step_rewards(
+        self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """
+        :return: discounted reward sums, (B,); rows of the last steps summed up, (B,); discounts of what follows, (B,)
+        """
+        if self.n_steps == 1:
+            return self._normalize_reward(self.rewards[rows, envs], env).astype(np.float32), rows, None
+        indices = (rows[:, None] + np.arange(self.n_steps)) % self.n_rows
+        ends = (self.endings[indices, envs[:, None]] != 0) | (indices == (self._n_added - 1) % self.n_rows)
+        ends[:, -1] = True
+        count = ends.argmax(axis=1) + 1  # steps up to and including the first that ends
+        powers = np.power(self.gamma, np.arange(self.n_steps + 1), dtype=np.float64)
+        used = np.arange(self.n_steps) < count[:, None]
+        rewards = self._normalize_reward(self.rewards[indices, envs[:, None]], env) * used @ powers[:-1]
+        last = np.take_along_axis(indices, count[:, None] - 1, axis=1)[:, 0]
+        return rewards.astype(np.float32), last, powers[count].astype(np.float32)
+
+    def _gather(self, rows: np.ndarray, envs: np.ndarray) -> Rows:
+        flat = rows * self.n_envs + envs
+        return {group: values.reshape(-1, values.shape[-1]).take(flat, axis=0) for group, values in self._rows.items()}
+
+    def _next_rows(self, rows: np.ndarray, envs: np.ndarray, only_stored: bool = False) -> Rows:
+        """Packed next observations: the following row, or what was kept apart."""
+        following = self._gather((rows + 1) % self.n_rows, envs)
+        # Step at which a row was written: the latest one below _n_added that falls on it
+        steps = self._n_added - 1 - (self._n_added - 1 - rows) % self.n_rows
+        ended = self.endings[rows, envs] != 0
+        if only_stored:
+            ended &= steps >= self._n_added - self.size()
+        positions = np.flatnonzero(ended)
+        if len(positions):
+            self._finals.replace_in(following, positions, (steps * self.n_envs + envs)[positions])
+        return following
+
+    def to_torch(self, array: np.ndarray, copy: bool = True) -> th.Tensor:
+        """See SB3's ``to_torch``; the tensor is of a type that torch computes with."""
+        return super().to_torch(computable(array), copy)
+
+    def _to_tensors(self, rows: Rows, env: VecNormalize | None) -> dict[str, th.Tensor]:
+        """One tensor per storage type, of which the entries are views; entry by entry only where they are normalised."""
+        if env is not None:
+            normalized = self._normalize_obs(self.layout.unpack(rows), env)
+            assert isinstance(normalized, dict)
+            return {key: self.to_torch(value, copy=False) for key, value in normalized.items()}
+        tensors = {group: self.to_torch(values, copy=False) for group, values in rows.items()}
+        observation = {}
+        for key, (group, columns) in self.layout.columns.items():
+            values = tensors[group][:, columns]
+            if self.layout.dtypes[key].name != group:
+                values = values.to(th.float32)
+            observation[key] = values.reshape(-1, *self.layout.shapes[key])
+        return observation
+
+    def _check_memory(self, transition_bytes: int) -> None:
+        needed, available = transition_bytes * self.n_rows * self.n_envs, psutil.virtual_memory().available
+        if needed > available:
+            raise MemoryError(
+                f"A replay buffer of {self.buffer_size * self.n_envs:,} transitions needs {needed / 1e9:.2f} GB, but "
+                f"{available / 1e9:.2f} GB are available: lower buffer_size to at most "
+                f"{int(available // transition_bytes):,}, or set replay_buffer_kwargs={{'storage_dtype': 'float16'}}."
+            )

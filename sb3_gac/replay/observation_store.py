@@ -1,0 +1,189 @@
+"""Where a replay buffer keeps dict observations: each once, all entries of a row side by side."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_gac.checks.entries import stored_shape
+
+Rows = dict[str, np.ndarray]
+
+
+class ObservationLayout:
+    """
+    Packs a dict observation into one row per storage type, so that a batch is gathered in one call for all entries.
+
+    :param space: of the observations
+    :param float_dtype: how floating-point entries are stored, ``None`` for their own type
+    :raises ValueError: if that is no floating-point type
+    """
+
+    def __init__(self, space: spaces.Dict, float_dtype: np.dtype | None = None):
+        if float_dtype is not None and not np.issubdtype(float_dtype, np.floating):
+            raise ValueError(f'storage_dtype must be a floating-point type such as "float16", or None, got "{float_dtype}".')
+        self.shapes = {key: stored_shape(entry) for key, entry in space.spaces.items()}
+        self._given_shapes = {key: entry.shape or () for key, entry in space.spaces.items()}
+        self.dtypes = {key: np.dtype(entry.dtype) for key, entry in space.spaces.items()}
+        self.columns: dict[str, tuple[str, slice]] = {}
+        self.widths: dict[str, int] = {}
+        for key, shape in self.shapes.items():
+            is_float = np.issubdtype(self.dtypes[key], np.floating)
+            group = np.dtype(float_dtype if is_float and float_dtype is not None else self.dtypes[key]).name
+            start = self.widths.get(group, 0)
+            self.widths[group] = start + int(np.prod(shape))
+            self.columns[key] = (group, slice(start, self.widths[group]))
+
+    def row_bytes(self) -> int:
+        """Bytes of one packed observation."""
+        return sum(width * np.dtype(group).itemsize for group, width in self.widths.items())
+
+    def empty(self, *leading: int) -> Rows:
+        """
+        :param leading: dimensions before the columns
+        :return: storage type -> zeros of shape (\\*leading, width)
+        """
+        return {group: np.zeros((*leading, width), dtype=group) for group, width in self.widths.items()}
+
+    def pack(self, observation: Mapping[str, np.ndarray], n_rows: int) -> Rows:
+        """
+        :param observation: ``n_rows`` of each entry
+        :param n_rows: number of environments
+        :return: storage type -> shape (n_rows, width)
+        :raises ValueError: naming the entry that is missing, unknown or of another shape, or that holds a number too large
+            for the type it is stored in
+        """
+        if observation.keys() != self.columns.keys():
+            raise ValueError(
+                f"The replay buffer stores the entries {sorted(self.columns)}, but got an observation with "
+                f"{sorted(observation)}: pass it observations of its observation_space."
+            )
+        rows = {group: np.empty((n_rows, width), dtype=group) for group, width in self.widths.items()}
+        for key, (group, columns) in self.columns.items():
+            values = np.asarray(observation[key])
+            if values.shape not in ((n_rows, *self.shapes[key]), (n_rows, *self._given_shapes[key])):
+                raise ValueError(
+                    f'The replay buffer stores entry "{key}" in the shape {(n_rows, *self.shapes[key])}, environments first, '
+                    f"but got {values.shape}: pass it observations of its observation_space."
+                )
+            if group != values.dtype.name:
+                _check_range(key, values, np.dtype(group))
+            rows[group][:, columns] = values.reshape(n_rows, -1)
+        return rows
+
+    def unpack(self, rows: Rows) -> dict[str, np.ndarray]:
+        """
+        :param rows: storage type -> shape (\\*leading, width)
+        :return: entry -> shape (\\*leading, \\*entry shape), in the entry's own type; views where the type is stored as it is
+        """
+        observation = {}
+        for key, (group, columns) in self.columns.items():
+            values = rows[group][..., columns].astype(self.dtypes[key], copy=False)
+            observation[key] = values.reshape(*values.shape[:-1], *self.shapes[key])
+        return observation
+
+
+def _check_range(key: str, values: np.ndarray, stored: np.dtype) -> None:
+    """
+    :raises ValueError: if one of the values is infinite in the type that it is to be stored in
+    """
+    if stored.kind != "f" or np.can_cast(values.dtype, stored):
+        return
+    largest = np.finfo(stored).max
+    too_large = np.abs(values) > largest
+    if too_large.any():
+        raise ValueError(
+            f'Entry "{key}" holds {values[too_large][0]:g}, but with replay_buffer_kwargs={{"storage_dtype": "{stored}"}} the '
+            f"replay buffer holds numbers up to {largest:g}: leave storage_dtype out, or scale the entry in the environment. "
+            "The step was not stored."
+        )
+
+
+class FinalObservations:
+    """
+    The observations that no later row holds: those at episode ends. First in, first out, as the ring overwrites them.
+
+    :param layout: of the observations
+    """
+
+    def __init__(self, layout: ObservationLayout):
+        self._layout = layout
+        self._times = np.empty(16, dtype=np.int64)
+        self._rows = layout.empty(16)
+        self._first, self._end = 0, 0
+
+    def __len__(self) -> int:
+        return self._end - self._first
+
+    def nbytes(self) -> int:
+        """Bytes allocated."""
+        return self._times.nbytes + sum(rows.nbytes for rows in self._rows.values())
+
+    def state(self) -> dict[str, Any]:
+        """What is kept, copied."""
+        kept = slice(self._first, self._end)
+        return {"times": self._times[kept].copy(), "rows": {group: rows[kept].copy() for group, rows in self._rows.items()}}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state`
+        """
+        self._times, self._rows = state["times"], state["rows"]
+        self._first, self._end = 0, len(self._times)
+
+    def append(self, times: np.ndarray, rows: Rows) -> None:
+        """
+        :param times: increasing, and not before the latest step that was appended, shape (n,)
+        :param rows: storage type -> shape (n, width)
+        """
+        count = len(times)
+        if self._end + count > len(self._times):
+            self._make_room(count)
+        self._times[self._end : self._end + count] = times
+        for group, values in rows.items():
+            self._rows[group][self._end : self._end + count] = values
+        in_order = self._end == self._first or self._times[self._end - 1] < times[0]
+        self._end += count
+        if not in_order:
+            self._sort()
+
+    def forget_before(self, time: int) -> None:
+        """
+        :param time: whatever was appended with an earlier time is not needed any more
+        """
+        self._first += int(np.searchsorted(self._times[self._first : self._end], time))
+
+    def forget_from(self, time: int) -> None:
+        """
+        :param time: whatever was appended with it or a later one does not count: it is of a step whose storing was
+            interrupted
+        """
+        self._end = self._first + int(np.searchsorted(self._times[self._first : self._end], time))
+
+    def replace_in(self, rows: Rows, positions: np.ndarray, times: np.ndarray) -> None:
+        """
+        :param rows: storage type -> shape (B, width), changed in place
+        :param positions: which of the B rows end an episode
+        :param times: the times under which their final observations were appended
+        """
+        index = self._first + np.searchsorted(self._times[self._first : self._end], times)
+        for group, values in rows.items():
+            values[positions] = self._rows[group][index]
+
+    def _sort(self) -> None:
+        kept = slice(self._first, self._end)
+        order = np.argsort(self._times[kept])
+        self._times[kept] = self._times[kept][order]
+        for values in self._rows.values():
+            values[kept] = values[kept][order]
+
+    def _make_room(self, count: int) -> None:
+        """Move what is kept to the front, in new arrays if it fills more than half: amortised constant time."""
+        kept = slice(self._first, self._end)
+        size = max(2 * (len(self) + count), 16)
+        times, rows = np.empty(size, dtype=np.int64), self._layout.empty(size)
+        times[: len(self)] = self._times[kept]
+        for group, values in rows.items():
+            values[: len(self)] = self._rows[group][kept]
+        self._times, self._rows, self._first, self._end = times, rows, 0, len(self)

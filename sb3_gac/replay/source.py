@@ -1,0 +1,117 @@
+"""What a replay buffer gets of vectorised environments: raw observations where these can be normalised anew."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import (
+    VecCheckNan,
+    VecEnv,
+    VecEnvWrapper,
+    VecMonitor,
+    VecNormalize,
+    VecTransposeImage,
+    VecVideoRecorder,
+    unwrap_vec_normalize,
+)
+
+from sb3_gac.checks.environments import RAW_FINAL
+
+Entries = dict[str, np.ndarray]
+#: Wrappers that hand on observations as they are
+OBSERVERS = (VecMonitor, VecVideoRecorder, VecCheckNan)
+
+
+class RewardNormalizer:
+    """
+    A ``VecNormalize`` for observations that were stored as they were seen, that is, normalised: rewards alone are left to do.
+
+    :param normalizer: whose rewards these are
+    """
+
+    def __init__(self, normalizer: VecNormalize):
+        self._normalizer = normalizer
+
+    def normalize_obs(self, obs: Any) -> Any:
+        """
+        :param obs: as they were seen
+        :return: the same
+        """
+        return obs
+
+    def normalize_reward(self, reward: np.ndarray) -> np.ndarray:
+        """
+        :param reward: raw
+        :return: normalised with the newest statistics
+        """
+        return self._normalizer.normalize_reward(reward)
+
+
+class ReplaySource:
+    """
+    Under ``VecNormalize`` a buffer holds raw observations, which are normalised with the newest statistics when they are
+    sampled. Wrappers further out decide whether that can be: images that are transposed out there are transposed here as
+    well; where another wrapper changes observations (``VecFrameStack``, or one that nothing is known of), what the networks
+    see is stored as they see it. Rewards are raw in any case.
+
+    :param env: vectorised environments, as the networks see them
+    """
+
+    def __init__(self, env: VecEnv):
+        self.env = env
+        self.normalizer = unwrap_vec_normalize(env)
+        outside = [] if self.normalizer is None else _wrappers_outside(env, self.normalizer)
+        changing = [wrapper for wrapper in outside if type(wrapper) not in OBSERVERS]
+        self._transposers = [wrapper for wrapper in reversed(changing) if type(wrapper) is VecTransposeImage]
+        #: The wrapper because of which observations are stored as they are seen, ``None`` if there is none
+        self.in_the_way = next((wrapper for wrapper in changing if type(wrapper) is not VecTransposeImage), None)
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether what is stored is still to be normalised."""
+        return self.normalizer is not None and self.in_the_way is None
+
+    @property
+    def sampling_env(self) -> Any:
+        """What is to be passed to ``ReplayBuffer.sample``: normalises what is stored raw."""
+        if self.normalizer is None or self.is_raw:
+            return self.normalizer
+        return RewardNormalizer(self.normalizer)
+
+    def observation(self, seen: Mapping[str, np.ndarray]) -> Entries:
+        """
+        :param seen: what the environments have just returned, (n_envs, ...) of each entry
+        :return: what is to be stored of it; no later step changes these arrays
+        """
+        if self.normalizer is None or not self.is_raw:
+            return {key: np.array(values) for key, values in seen.items()}
+        return self._transposed(self.normalizer.get_original_obs())
+
+    def final(self, info: Mapping[str, Any]) -> Mapping[str, np.ndarray]:
+        """
+        :param info: of an environment whose episode has just ended
+        :return: what is to be stored of that episode's last observation
+        """
+        # VecNormalize's own, normalised and then undone, would be clipped and rounded
+        return self._transposed(info[RAW_FINAL]) if self.is_raw else info["terminal_observation"]
+
+    def reward(self, seen: np.ndarray) -> np.ndarray:
+        """
+        :param seen: what the environments have just returned, shape (n_envs,)
+        :return: raw
+        """
+        return seen if self.normalizer is None else self.normalizer.get_original_reward()
+
+    def _transposed(self, observation: Any) -> Any:
+        for wrapper in self._transposers:
+            observation = wrapper.transpose_observations(observation)
+        return observation
+
+
+def _wrappers_outside(env: Any, normalizer: VecNormalize) -> list[VecEnvWrapper]:
+    """Outermost first."""
+    found = []
+    while env is not normalizer:
+        found.append(env)
+        env = env.venv
+    return found

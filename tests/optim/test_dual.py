@@ -1,0 +1,87 @@
+"""Dual variables: they move towards their constraint, stay inside their bounds, and refuse what they can't be."""
+
+import pytest
+import torch as th
+
+from sb3_gac.optim.coefficients import DualVariable, FixedCoefficient, make_coefficient
+
+CPU = th.device("cpu")
+
+
+def _kl_coef(spec, bounds=(1e-4, 100.0)):
+    return make_coefficient("kl_coef", spec, 1.0, bounds, 3e-3, CPU)
+
+
+@pytest.mark.parametrize(("kl", "direction"), [(0.02, 1), (0.001, -1)])
+def test_moves_up_above_the_target_and_down_below(kl, direction):
+    dual = _kl_coef("auto_0.5")
+    before = dual.value.item()
+    loss = dual.update(th.full((8,), kl) - 0.005)["kl_coef_loss"]
+    assert direction * (dual.value.item() - before) > 0
+    assert dual.on_bound().item() == 0
+    assert loss.item() == pytest.approx(-0.5 * (kl - 0.005), rel=1e-5)
+
+
+@pytest.mark.parametrize(("violation", "bound"), [(1.0, 0.6), (-1.0, 0.4)])
+def test_stops_at_its_bounds_and_says_so(violation, bound):
+    dual = _kl_coef("auto_0.5", bounds=(0.4, 0.6))
+    for _ in range(100):
+        dual.update(th.tensor([violation]))
+    assert dual.value.item() == pytest.approx(bound)
+    assert dual.on_bound().item() == 1
+
+
+def test_leaves_a_bound_when_the_constraint_turns():
+    dual = _kl_coef("auto_0.6", bounds=(0.4, 0.6))
+    for _ in range(200):
+        dual.update(th.tensor([1.0]))
+    for _ in range(400):
+        dual.update(th.tensor([-1.0]))
+    assert dual.value.item() == pytest.approx(0.4)
+    assert dual.on_bound().item() == 1
+
+
+@pytest.mark.parametrize(("spec", "value"), [(0.3, 0.3), ("0.3", 0.3), (0, 0.0), (1, 1.0)])
+def test_a_number_stays_fixed(spec, value):
+    coefficient = _kl_coef(spec)
+    assert isinstance(coefficient, FixedCoefficient)
+    assert coefficient.update(th.ones(3)) == {}
+    assert coefficient.on_bound().item() == 0
+    assert coefficient.value.item() == pytest.approx(value)
+
+
+@pytest.mark.parametrize(("spec", "value"), [("auto", 1.0), ("auto_0.25", 0.25)])
+def test_auto_starts_where_it_is_told(spec, value):
+    coefficient = _kl_coef(spec)
+    assert isinstance(coefficient, DualVariable)
+    assert coefficient.value.item() == pytest.approx(value)
+
+
+@pytest.mark.parametrize(("bounds", "start"), [((2.0, 8.0), 2.0), ((0.01, 0.5), 0.5), ((0.01, 8.0), 1.0)])
+def test_auto_starts_inside_its_bounds(bounds, start):
+    """At the bound that is nearest where its usual start lies outside, and the bounds stay what they are."""
+    dual = _kl_coef("auto", bounds)
+    assert dual.value.item() == pytest.approx(start)
+    assert dual.on_bound().item() == (start in bounds)
+    assert dual.bounds == bounds
+    for far_away, bound in zip((-20.0, 20.0), bounds, strict=True):
+        dual.log_value.data.fill_(far_away)
+        dual.update(th.zeros(1))
+        assert dual.value.item() == pytest.approx(bound)
+
+
+@pytest.mark.parametrize("spec", ["automatic", "auto_", "auto_x", "auto_-1", "auto_0", "none", -0.1, float("nan"), None])
+def test_bad_coefficients_are_refused_by_name(spec):
+    with pytest.raises(ValueError, match="kl_coef must be"):
+        _kl_coef(spec)
+
+
+@pytest.mark.parametrize("bounds", [(1.0, 0.1), (0.0, 1.0), (1.0,), 3.0, (1.0, float("inf")), None])
+def test_bad_bounds_are_refused_by_name(bounds):
+    with pytest.raises(ValueError, match="kl_coef_bounds must be"):
+        _kl_coef("auto", bounds=bounds)
+
+
+def test_a_start_value_outside_the_bounds_is_refused():
+    with pytest.raises(ValueError, match="outside kl_coef_bounds"):
+        _kl_coef("auto_200")

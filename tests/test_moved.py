@@ -1,0 +1,33 @@
+"""Modules are found under the names that they had in earlier versions, and what was saved under these can be read."""
+
+import importlib
+import pickle
+import sys
+
+import pytest
+
+from sb3_gac.checkpoint.serialization import dereference
+from sb3_gac.moved import MOVED
+
+
+@pytest.mark.parametrize("former", MOVED)
+def test_a_module_is_found_under_its_former_name(former):
+    sys.modules.pop(former, None)
+    with pytest.warns(DeprecationWarning, match=f"{former} is {MOVED[former]} now"):
+        module = importlib.import_module(former)
+    present = importlib.import_module(MOVED[former])
+    assert present.__name__ == MOVED[former]
+    assert all(getattr(module, name) is value for name, value in vars(present).items() if not name.startswith("__"))
+
+
+@pytest.mark.filterwarnings("ignore:sb3_gac.common:DeprecationWarning")
+def test_what_was_saved_names_the_former_modules():
+    from sb3_gac import CompactDictReplayBuffer
+
+    assert pickle.loads(b"csb3_gac.common.buffers\nCompactDictReplayBuffer\n.") is CompactDictReplayBuffer
+    assert dereference("sb3_gac.common.buffers:CompactDictReplayBuffer") is CompactDictReplayBuffer
+
+
+def test_other_names_are_nowhere():
+    with pytest.raises(ModuleNotFoundError, match=r"sb3_gac\.common\.nothing"):
+        importlib.import_module("sb3_gac.common.nothing")
