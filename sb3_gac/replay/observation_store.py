@@ -35,6 +35,11 @@ class ObservationLayout:
             self.widths[group] = start + int(np.prod(shape))
             self.columns[key] = (group, slice(start, self.widths[group]))
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Buffers that were saved before shapes were compared do not say which ones they were given."""
+        given = {key: () if shape == (1,) else shape for key, shape in state["shapes"].items()}
+        vars(self).update({"_given_shapes": given, **state})
+
     def row_bytes(self) -> int:
         """Bytes of one packed observation."""
         return sum(width * np.dtype(group).itemsize for group, width in self.widths.items())

@@ -435,6 +435,16 @@ def test_what_float16_cannot_hold_is_refused_by_name(key, value):
     assert np.isfinite(buffer.observations[key]).all()
 
 
+def test_a_buffer_that_was_saved_before_shapes_were_compared(tmp_path):
+    buffer = CompactDictReplayBuffer(20, ODD_SPACE, spaces.Box(-1, 1, (1,)), "cpu", n_envs=2)
+    _add_pair(buffer, _odd_observation(), _odd_observation())
+    del buffer.layout._given_shapes
+    save_to_pkl(tmp_path / "buffer", buffer)
+    loaded = load_from_pkl(tmp_path / "buffer")
+    _add_pair(loaded, _odd_observation(), _odd_observation(gear=np.zeros((2, 1), np.int64)))
+    assert loaded.pos == 2
+
+
 def test_counted_entries_are_not_stored_in_float16():
     buffer = CompactDictReplayBuffer(20, ODD_SPACE, spaces.Box(-1, 1, (1,)), "cpu", n_envs=2, storage_dtype="float16")
     _add_pair(buffer, _odd_observation(gear=np.array([3, 1])), _odd_observation())
