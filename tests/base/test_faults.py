@@ -74,7 +74,7 @@ def test_a_replay_buffer_of_more_environments_is_named(tmp_path):
 
 
 def test_an_error_of_a_callback_ends_the_episode_too():
-    """Its step was taken but not stored: what follows must not be stored as if it came next."""
+    """Its step is stored, and what follows a reset is not stored as if it came next."""
 
     class Stop(Exception):  # noqa: N818
         pass
@@ -88,4 +88,5 @@ def test_an_error_of_a_callback_ends_the_episode_too():
     with pytest.raises(Stop):
         model.learn(10, callback=callback)
     model.learn(5, reset_num_timesteps=False)
-    assert model.replay_buffer.endings[:11, 0].nonzero()[0].tolist() == [5]
+    assert model.replay_buffer.pos == 12
+    assert model.replay_buffer.endings[:12, 0].nonzero()[0].tolist() == [6]
