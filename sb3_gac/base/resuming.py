@@ -285,7 +285,7 @@ class ResumableAlgorithm(NetworkTraining):
         assert self.env is not None
         why = "there was none" if state is None else restore_vec_env_state(self.env, state)
         if why:
-            warnings.warn(f"New episodes start, since those of the checkpoint can't be gone on with: {why}.", stacklevel=4)
+            warnings.warn(f"Starting new episodes: the environments cannot be restored ({why}).", stacklevel=4)
             self._last_obs = None
             self.env.seed(int(generators["numpy"][1][0]) % 2**31)  # the same for the same checkpoint
         self._note_use()

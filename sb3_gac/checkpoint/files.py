@@ -208,6 +208,6 @@ def latest_whole(root: Path) -> tuple[Path, dict[str, bytes]]:
             refused.append(str(error))
             continue
         if refused:
-            warnings.warn(f"{directory} is used, since of later checkpoints {'; '.join(refused)}.", stacklevel=3)
+            warnings.warn(f"Resuming from {directory}; later checkpoints are damaged: {'; '.join(refused)}.", stacklevel=3)
         return directory, files
     raise CheckpointError(f"There is no whole checkpoint in {root}: {'; '.join(refused) or 'it has none at all'}.")

@@ -216,8 +216,8 @@ class EnvironmentGuard:
         for frame in frames:  # SB3's own loops know which environment they are at
             if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
                 return EnvironmentFailedError(
-                    f"Environment {frame.f_locals['env_idx']} raised {said} {KEPT}: mend the "
-                    f"environment; {GO_ON}, or set_env(...) first gives the model another one."
+                    f"Environment {frame.f_locals['env_idx']} raised {said} {KEPT} Fix the "
+                    "environment (or call set_env) and continue with learn(..., reset_num_timesteps=False)."
                 )
             if frame.f_code.co_name == "_stack_obs":
                 for number, observation in enumerate(frame.f_locals["obs_list"]):

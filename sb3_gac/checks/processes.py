@@ -7,7 +7,7 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-KEPT = "Nothing of this step was stored, and all that was learned before is kept"
+KEPT = "The step was discarded; the model is intact."
 PATIENCE = 2.0  # seconds that a process whose pipe has closed has to end
 
 
@@ -88,13 +88,13 @@ def end_processes(env: SubprocVecEnv) -> str:
         remote.close()
     env.waiting, env.closed = False, True
     others = (
-        f"{KEPT}: the other processes were ended, so give the model new environments with set_env(...) and go on with "
+        f"{KEPT} The other processes were ended: give the model new environments with set_env(...) and continue with "
         "learn(..., reset_num_timesteps=False)."
     )
     if torn and not codes:
         return f"The process of environment {torn[0]} was interrupted within a message and makes no sense any more. {others}"
     dead = ", ".join(f"{index} (exit code {code})" for index, code in codes.items()) or "unknown"
     return (
-        f"The process of environment {dead} died. An exit code of 1 is an exception, whose traceback stands above; a negative "
-        f"one a signal, such as -9 for lack of memory; one of 0 after an interrupt, which ends all of them. {others}"
+        f"The process of environment {dead} died. An exit code of 1 is an exception, whose traceback stands above. A negative "
+        f"one is a signal, such as -9 for lack of memory. After an interrupt, which ends all processes, it is 0. {others}"
     )

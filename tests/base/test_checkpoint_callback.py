@@ -148,6 +148,6 @@ def test_ctrl_c_in_a_terminal_ends_the_environments_too_and_makes_a_checkpoint(t
     with pytest.raises(KeyboardInterrupt, match="the checkpoint after 28 steps is in"):
         model.learn(100, callback=ExactCheckpointCallback(tmp_path, every=1000))
     assert _steps(tmp_path) == [28]
-    with pytest.warns(UserWarning, match="New episodes start"):
+    with pytest.warns(UserWarning, match="Starting new episodes"):
         resumed = GAC.resume(tmp_path, DummyVecEnv([TwoViewBandit] * 2), device="cpu")
     assert resumed.learn(8, reset_num_timesteps=False).replay_buffer.pos == 18

@@ -253,7 +253,7 @@ def test_episodes_that_cannot_be_gone_on_with_are_named(tmp_path):
 
     model = small_model(Unknown(TwoViewBandit(length=7))).learn(30)
     model.save_checkpoint(tmp_path)
-    with pytest.warns(UserWarning, match=r"New episodes start, .*Unknown is: give it the methods checkpoint_state"):
+    with pytest.warns(UserWarning, match=r"Starting new episodes: .*Unknown is: give it the methods checkpoint_state"):
         resumed = GAC.resume(tmp_path, Unknown(TwoViewBandit(length=7)), device="cpu")
     resumed.learn(30, reset_num_timesteps=False)
     assert resumed.num_timesteps == 60

@@ -76,7 +76,7 @@ def test_a_damaged_checkpoint_is_refused_by_name_and_the_one_before_it_used(name
     if name == "block":
         (path,) = (path for path in (tmp_path / "blocks").iterdir() if path.read_bytes() == b"of its own")
     damage(path)
-    with pytest.warns(UserWarning, match=f"{before.name} is used, since of later checkpoints .*{path.name}"):
+    with pytest.warns(UserWarning, match=f"Resuming from .*{before.name}; later checkpoints are damaged: .*{path.name}"):
         assert latest_whole(tmp_path)[1]["state"] == b"before"
 
 

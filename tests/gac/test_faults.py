@@ -148,10 +148,10 @@ def test_an_environment_that_raises_is_named_and_training_goes_on_with_it(wrappe
 @pytest.mark.parametrize(
     ("says", "said"),
     [
-        ("it fell", "RuntimeError: it fell. Nothing"),
-        ("It fell.", "RuntimeError: It fell. Nothing"),
-        ("why?\n", "RuntimeError: why? Nothing"),
-        ("", "raised RuntimeError. Nothing"),
+        ("it fell", "RuntimeError: it fell. The step"),
+        ("It fell.", "RuntimeError: It fell. The step"),
+        ("why?\n", "RuntimeError: why? The step"),
+        ("", "raised RuntimeError. The step"),
     ],
 )
 def test_what_an_environment_says_stays_apart_from_what_is_said_of_it(cls, says, said):
