@@ -51,7 +51,7 @@ def test_acting_step_by_step_is_what_training_sees(cls, policy, continuous):
     network = model.policy.deployed
     sequence = _observations(5, 3)
     with th.no_grad():
-        at_once = network(sequence)
+        at_once = network.distribution(sequence)
         state, starts = None, np.ones(3, dtype=bool)
         for step in range(5):
             one = {key: value[step] for key, value in sequence.items()}
