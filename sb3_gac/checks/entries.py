@@ -32,22 +32,28 @@ REMEDIES: dict[type[spaces.Space], str] = {
 }
 
 
+class UnsupportedObservationError(NotImplementedError, ValueError):
+    """An observation's entry is of a kind that can't be learned from. SB3 raises NotImplementedError for nested ones."""
+
+
 # --- spaces -------------------------------------------------------------------------------------------------------------
 
 
 def check_entries(space: spaces.Space) -> None:
     """
     :param space: of an environment's observations; those that are no Dict are not looked at
-    :raises ValueError: naming the first entry that can't be learned from, and what to do about it
+    :raises UnsupportedObservationError: naming the first entry that can't be learned from, and what to do about it
     """
     if not isinstance(space, spaces.Dict):
         return
     for key, entry in space.spaces.items():
         if not isinstance(key, str) or not key:
-            raise ValueError(f"The observation has an entry named {key!r}: name it by a string that is not empty.")
+            raise UnsupportedObservationError(
+                f"The observation has an entry named {key!r}: name it by a string that is not empty."
+            )
         fault = _unsupported(entry)
         if fault is not None:
-            raise ValueError(f"The observation's entry \"{key}\" can't be learned from: {fault}")
+            raise UnsupportedObservationError(f"The observation's entry \"{key}\" can't be learned from: {fault}")
 
 
 def _unsupported(space: spaces.Space) -> str | None:

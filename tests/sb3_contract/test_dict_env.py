@@ -99,5 +99,5 @@ def test_vec_normalize_of_chosen_entries(keys):
 
 def test_nested_dicts_are_refused():
     env = RandomEnv(spaces.Dict({PARTIAL: VECTOR, PRIVILEGED: spaces.Dict({"nested": VECTOR})}), ACTIONS)
-    with pytest.raises(NotImplementedError, match="Nested"):
+    with pytest.raises(NotImplementedError, match=r'entry "privileged".*its space is Dict. Make each of its parts an entry'):
         GAC("MultiInputPolicy", env)

@@ -71,9 +71,13 @@ def test_full_buffer():
 
 
 def test_buffer_needs_an_environment(tmp_path):
-    _make(make_vec_env(_env)).save(tmp_path / "model")
+    model = _make(make_vec_env(_env)).learn(20)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = GAC.load(tmp_path / "model")  # to act
+    assert loaded.replay_buffer is None
     with pytest.raises(AssertionError, match="HerReplayBuffer"):
-        GAC.load(tmp_path / "model")
+        loaded.load_replay_buffer(tmp_path / "buffer")
 
 
 # --- what it needs of an environment -------------------------------------------------------------------------------------
