@@ -264,10 +264,12 @@ def test_many_environments_end_at_once():
         np.testing.assert_array_equal(batch.next_observations["partial"][i], wanted[key][2]["next"]["partial"])
 
 
-def test_too_large_a_buffer_is_refused_with_the_numbers(monkeypatch):
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 10_000}))
-    with pytest.raises(MemoryError, match=r"10,000 transitions needs 0\.00 GB.*lower buffer_size to at most 222"):
-        _make(10_000, 1)
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_too_large_a_buffer_is_refused_with_the_numbers(n_envs, monkeypatch):
+    """Those of all environments together: a quarter of them would fit."""
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 200_000}))
+    with pytest.raises(MemoryError, match=r"10,000 transitions needs 0\.00 GB.*lower buffer_size to at most 4,444"):
+        _make(10_000 // n_envs, n_envs)
 
 
 @pytest.mark.parametrize("n_steps", [1, 3])
