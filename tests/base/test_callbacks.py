@@ -295,3 +295,30 @@ def test_says_nothing_before_there_were_gradient_steps():
         _model(_vec_env(), learning_starts=100).learn(6, callback=callback)
     assert len(callback.history) == 3
     assert "kl" not in callback.history[-1]
+
+
+def test_kl_is_the_mean_since_the_evaluation_before():
+    evaluate = _evaluator(patience=1)
+    assert evaluate(kl=1.0) != []
+    assert evaluate(kl=0.01) == []
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_both_policies_act_as_they_are_asked_to(deterministic):
+    asked = []
+
+    class Noting(Scripted):
+        def predict(self, *args, deterministic=False, **kwargs):
+            asked.append(("learner", deterministic))
+            return super().predict(*args, **kwargs)
+
+        def predict_guider(self, *args, deterministic=False, **kwargs):
+            asked.append(("guider", deterministic))
+            return super().predict_guider(*args, **kwargs)
+
+    model = Noting()
+    model.actions = {"guider": 0.0, "learner": 0.0}
+    callback = _callback(_vec_env(), eval_freq=1, deterministic=deterministic)
+    callback.init_callback(model)
+    assert callback.on_step()
+    assert set(asked) == {("learner", deterministic), ("guider", deterministic)}

@@ -279,3 +279,13 @@ def test_a_subclass_that_hands_its_arguments_on(tmp_path):
     assert (resumed.gamma, resumed.weight, resumed.tau) == (0.8, 2.0, 0.1)
     with pytest.raises(TypeError, match=r'"gama", which is no argument of _HandsOn. Is "gamma" meant'):
         _HandsOn.load(tmp_path / "model", gama=0.5)
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+def test_a_policy_that_is_saved_by_itself_has_the_scales_that_were_given(cls, tmp_path):
+    again = _again("load", small_model(cls=cls), tmp_path, lr_scales={"critic": 3.0})
+    again.policy.save(tmp_path / "policy")
+    loaded = type(again.policy).load(tmp_path / "policy")
+    scales = [[optimizer.param_groups[0]["lr_scale"] for optimizer in optimizers_of(p)] for p in (again.policy, loaded)]
+    assert scales[0] == scales[1]
+    assert set(scales[1]) == {1.0, 3.0}

@@ -480,3 +480,16 @@ def _then_interrupt(method):
         raise KeyboardInterrupt
 
     return interrupted
+
+
+@pytest.mark.parametrize("n_added", [0, 1, 6, 7, 8, 9, 14, 15, 20])
+def test_a_restored_buffer_is_where_the_other_one_was(n_added):
+    """Seven transitions fit: before it is full, just when it is, and after."""
+    feeder, again = Feeder(_make(7, 2), 2, seed=1), _make(7, 2)
+    for _ in range(n_added):
+        feeder.step()
+    again.restore_bookkeeping(feeder.buffer.bookkeeping())
+    assert [(b.pos, b.full, b.size(), b.n_added) for b in (again,)] == [
+        (b.pos, b.full, b.size(), b.n_added) for b in (feeder.buffer,)
+    ]
+    assert again.full == (n_added >= 7)
