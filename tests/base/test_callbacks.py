@@ -297,12 +297,6 @@ def test_says_nothing_before_there_were_gradient_steps():
     assert "kl" not in callback.history[-1]
 
 
-def test_kl_is_the_mean_since_the_evaluation_before():
-    evaluate = _evaluator(patience=1)
-    assert evaluate(kl=1.0) != []
-    assert evaluate(kl=0.01) == []
-
-
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_both_policies_act_as_they_are_asked_to(deterministic):
     asked = []

@@ -51,14 +51,14 @@ def test_an_error_after_a_signal_is_not_hidden_by_it(tmp_path):
 
     class Failing(TwoViewBandit):
         def step(self, action):
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
             return super().step(action)
 
     def fails(*scope):
         raise RuntimeError("of another kind")
 
     callback = [ExactCheckpointCallback(tmp_path, every=30), ConvertCallback(fails)]
-    with pytest.warns(UserWarning, match="SIGINT"), pytest.raises(RuntimeError, match="of another kind"):
+    with pytest.warns(UserWarning, match="SIGTERM"), pytest.raises(RuntimeError, match="of another kind"):
         small_model(Failing()).learn(100, callback=callback)
     assert _steps(tmp_path) == []
 
@@ -67,12 +67,12 @@ def test_a_signal_that_an_earlier_training_did_not_get_to_is_forgotten(tmp_path)
     class Signalling(TwoViewBandit):
         def step(self, action):
             if model.num_timesteps == 19:
-                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), signal.SIGTERM)
             return super().step(action)
 
     model = small_model(Signalling())
     callback = ExactCheckpointCallback(tmp_path, every=100)
-    with pytest.warns(UserWarning, match="SIGINT"):
+    with pytest.warns(UserWarning, match="SIGTERM"):
         model.learn(20, callback=callback)
     assert model.learn(20, callback=callback, reset_num_timesteps=False).num_timesteps == 40
 

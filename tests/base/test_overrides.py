@@ -135,6 +135,21 @@ def test_what_is_given_counts(how, cls, tmp_path):
     assert {name: read(again) for name, (_, read) in expected.items()} == given
 
 
+@pytest.mark.parametrize("how", HOW)
+def test_the_last_episodes_stay_as_far_as_there_is_room(how, tmp_path):
+    model = small_model().learn(20)
+    again = _again(how, model, tmp_path, stats_window_size=3)
+    assert list(again.ep_info_buffer) == list(model.ep_info_buffer)[-3:]
+    assert len(again.ep_info_buffer) == 3
+    assert list(_again(how, model, tmp_path, tau=0.1).ep_info_buffer) == list(model.ep_info_buffer)
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_policy_kwargs_that_are_new_are_refused_by_name(how, tmp_path):
+    with pytest.raises(ValueError, match=r"policy_kwargs can't be changed.*: n_critics is 3, and was None\."):
+        _again(how, small_model().learn(1), tmp_path, policy_kwargs={"net_arch": [16], "n_critics": 3})
+
+
 def test_another_seed_counts_and_the_same_one_changes_nothing(tmp_path):
     model = small_model(learning_starts=100).learn(20)
     draws = []
