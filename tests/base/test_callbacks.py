@@ -316,3 +316,15 @@ def test_both_policies_act_as_they_are_asked_to(deterministic):
     callback.init_callback(model)
     assert callback.on_step()
     assert set(asked) == {("learner", deterministic), ("guider", deterministic)}
+
+
+@pytest.mark.parametrize("whose", ["guider", "learner"])
+def test_the_spread_of_either_policys_returns_may_explain_a_gap(whose):
+    steady = {"guider": np.full(4, 5.0), "learner": np.full(4, 3.0)}
+    callback = _callback(_vec_env(), patience=1)
+    callback.num_timesteps = 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        callback._warn_if_not_following(*(steady | {whose: steady[whose] + np.array([-8, 8, -8, 8])}).values())
+    with pytest.warns(UserWarning, match="the guider returns 5 and the learner 3"):
+        callback._warn_if_not_following(*steady.values())
