@@ -146,18 +146,20 @@ def test_a_new_training_begins_with_a_rollout_of_its_own():
     assert starts == [0, 0, 6]
 
 
-def test_episodes_and_logs_are_counted(tmp_path):
+@pytest.mark.parametrize(("log_interval", "steps"), [(3, ["16", "30", "40"]), (4, ["20", "40"]), (8, ["40"])])
+def test_episodes_and_logs_are_counted(log_interval, steps, tmp_path):
+    """Where two episodes end at once, either may be the one after which a log is due."""
     from stable_baselines3.common.logger import configure
 
     model = _model(Diary().envs(2, length=4))  # episodes of four and of five steps
     logger = configure(str(tmp_path), ["csv"])
     model.set_logger(logger)
-    model.learn(40, log_interval=3)  # ends at steps 4, 5, 8, 10, 12, 15, 16, 20 and 20
+    model.learn(40, log_interval=log_interval)  # ends at steps 4, 5, 8, 10, 12, 15, 16, 20 and 20
     assert model._episode_num == 9
     lines = (tmp_path / "progress.csv").read_text().splitlines()
     columns = lines[0].split(",")
     logged = [dict(zip(columns, line.split(","), strict=True)) for line in lines[1:]]
-    assert [row["time/total_timesteps"] for row in logged] == ["16", "30", "40"]
+    assert [row["time/total_timesteps"] for row in logged] == steps
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
@@ -606,7 +608,8 @@ class _Infos(VecEnvWrapper):
     """
     Tells of episodes' ends in one of several ways.
 
-    :param how: "missing", "kept" (the same dicts in each step, told in even episodes only), "left" (never removed), "shared"
+    :param how: "missing", "kept" (the same dicts in each step, told in even episodes only), "left" (never removed), "half"
+        (the time limit alone never removed), "shared"
     """
 
     def __init__(self, venv, how):
@@ -626,7 +629,9 @@ class _Infos(VecEnvWrapper):
         for kept, info, done in zip(self.kept, infos, dones, strict=True):
             final = info.pop("terminal_observation", None)
             truncated = info.pop("TimeLimit.truncated")
-            if done and (self.how == "left" or (self.how == "kept" and final["partial"][1] % 2 == 0)):
+            if self.how == "half":
+                kept.pop("terminal_observation", None)
+            if done and (self.how in ("left", "half") or (self.how == "kept" and final["partial"][1] % 2 == 0)):
                 kept["terminal_observation"] = final
             if truncated:
                 kept["TimeLimit.truncated"] = True
@@ -665,10 +670,11 @@ class _Mixed(DiaryEnv):
 
 @kinds
 @pytest.mark.parametrize("normalized", [False, True])
-def test_what_was_left_in_an_info_does_not_count(cls, policy, buffer, normalized):
+@pytest.mark.parametrize("how", ["left", "half"])
+def test_what_was_left_in_an_info_does_not_count(cls, policy, buffer, normalized, how):
     """A time limit of an earlier episode, above all, must not make a later one bootstrap."""
     diary = Diary()
-    env = _Infos(DummyVecEnv([lambda: _Mixed(diary)] * 2), "left")
+    env = _Infos(DummyVecEnv([lambda: _Mixed(diary)] * 2), how)
     model = _model(VecNormalize(env) if normalized else env, cls, policy, buffer).learn(60)
     assert_true_and_whole(model, diary)
     assert {ended[4:] for ended in stored_transitions(model) if ended[4]} == {(True, False), (True, True)}
