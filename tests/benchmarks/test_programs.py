@@ -24,7 +24,7 @@ import benchmarks.suite
 from benchmarks.aggregate import finished_runs, origins
 from benchmarks.checkpoint import SB3Checkpoints, checkpoints_of, locked
 from benchmarks.config import check_runs, environment, instantiate, read_algorithm, resolve
-from benchmarks.finished import name_of
+from benchmarks.finished import kind_of, name_of
 from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
 from benchmarks.suite import RunSpec, made_with, read_preset, read_suite
@@ -339,6 +339,21 @@ def test_committed_results_count_for_the_same_settings_alone(tmp_path, change):
     path.write_text(yaml.safe_dump(yaml.safe_load(FIGURE.read_text()) | change))
     _, finished = jobs_left(path, tmp_path, [RESULTS])
     assert (finished > 0) == (not change)
+
+
+def test_committed_results_count_for_the_same_arguments_alone(tmp_path):
+    """Those that a preset has now, though the suite is as it was."""
+    shutil.copy(RESULTS.with_suffix(".csv"), tmp_path / "results.csv")
+    results = json.loads(RESULTS.with_suffix(".json").read_text())
+    changed = next(iter(results["arguments"]))
+    results["arguments"][changed] = {**results["arguments"][changed], "tau": 0.4321}
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    before, after = (
+        [name_of(job.spec) for job in jobs_left(FIGURE, tmp_path, [path])[0]] for path in (RESULTS, tmp_path / "results")
+    )
+    again = {name_of(spec) for spec in read_suite(FIGURE) if kind_of(spec) == changed}
+    assert set(after) == set(before) | again
+    assert again - set(before)
 
 
 def test_what_is_missing_altogether_is_an_error_in_any_case(tmp_path):
