@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, Learner, export_learner
-from sb3_gac.networks.critics import EntryExtractor, module_names
+from sb3_gac.networks.encoders import EntryExtractor, module_names
 from tests.helpers import Sampled, TwoViewBandit, small_model
 
 VECTOR = spaces.Box(-1, 1, (2,), np.float32)
