@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
-from tests.helpers import optimizers_of, small_model, unlike_each_other
+from tests.helpers import Sampled, optimizers_of, small_model, unlike_each_other
 from tests.plain.replay import Recorded
 
 ALGORITHMS = pytest.mark.parametrize("cls", [GAC, GACShare, GACWithoutQ, AsymmetricSAC])
@@ -112,3 +114,31 @@ def test_all_rates_but_kl_coefs_follow_the_schedule(cls):
         assert optimizer.param_groups[0]["lr"] == pytest.approx(expected)
     if cls is not AsymmetricSAC:
         assert model.kl_coef_dual.optimizer.param_groups[0]["lr"] == model.kl_coef_learning_rate
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+def test_rounding_does_not_lead_beyond_the_upper_bound(cls):
+    low = np.random.default_rng(0).uniform(-3, -1, 1_000).astype(np.float32)
+    high = np.random.default_rng(1).uniform(1, 3, 1_000).astype(np.float32)
+    model = small_model(Sampled(Recorded().observation_space, spaces.Box(low, high)), cls, policy_kwargs={"net_arch": [2]})
+    largest = np.ones((1, 1_000), np.float32)
+    assert (BasePolicy.unscale_action(model.policy, largest) > high).any(), "as it would"
+    for policy in (model.policy, model.policy.deployed):
+        assert (policy.unscale_action(largest) <= high).all()
+        np.testing.assert_array_equal(policy.unscale_action(-largest)[0], low)
+
+
+def test_the_guider_acts_without_what_only_training_has():
+    """Dropout, above all."""
+
+    class Dropout(th.nn.Dropout):
+        def __init__(self):
+            super().__init__(0.5)
+
+    model = small_model(Recorded(), policy_kwargs={"net_arch": [32], "activation_fn": Dropout}, guider="independent")
+    model.policy.set_training_mode(True)
+    observation = {"partial": np.ones((1, 3), np.float32), "privileged": np.ones((1, 2), np.float32)}
+    for predict in (model.predict_guider, model.predict):
+        model.policy.set_training_mode(True)
+        actions = [predict(observation, deterministic=True)[0] for _ in range(5)]
+        np.testing.assert_array_equal(actions, [actions[0]] * 5)

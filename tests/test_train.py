@@ -159,3 +159,31 @@ def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, monkeypatch, c
     with pytest.raises(SystemExit):
         main(["--resume", str(directory)])
     assert "this run is finished" in capsys.readouterr().err
+
+
+def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_path, monkeypatch):
+    asked = []
+
+    def evaluated(policy, env, n_eval_episodes):
+        asked.append((type(policy).__name__, n_eval_episodes, env.seeds.pop()))
+        return {"PartialOnly": (1.0, 2.0), "UniformActions": (3.0, 4.0)}[asked[-1][0]]
+
+    model = SimpleNamespace(save=lambda path: None, num_timesteps=7)
+    space = SimpleNamespace(seed=lambda seed: None)
+    seeds = []
+    env = SimpleNamespace(seeds=seeds, seed=seeds.append, action_space=space, num_envs=1)
+    monkeypatch.setattr(sb3_gac.train, "evaluate_policy", evaluated)
+    monkeypatch.setattr(sb3_gac.train, "make_vec_env", lambda *args, **kwargs: env)
+    monkeypatch.setattr(sb3_gac.train, "learn", lambda *args: (model, [], 1.5))
+    monkeypatch.setattr(sb3_gac.train, "draw_learning_curve", lambda *args: None)
+    (tmp_path / "checkpoints").mkdir()
+    train(parse_arguments(["--episodes", "3"]), tmp_path)
+    assert asked == [("PartialOnly", 3, 10_000), ("UniformActions", 3, 10_000)]
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert [results.pop(name) for name in ("learner", "learner_std", "random", "random_std")] == [1.0, 2.0, 3.0, 4.0]
+    assert results == {"steps": 7, "minutes": 1.5, "history": []}
+
+
+@pytest.mark.parametrize(("steps", "size"), [(10, 1_000), (5_000, 5_000), (10**7, 10**6)])
+def test_a_buffer_holds_the_run_within_bounds(steps, size):
+    assert gac_arguments(parse_arguments(["--steps", str(steps)]))["buffer_size"] == size

@@ -11,7 +11,7 @@ import yaml
 pytest.importorskip("rl_zoo3")
 
 from sb3_gac import envs
-from sb3_gac.zoo import ALGORITHMS, HYPERPARAMS, convert, with_hyperparameters
+from sb3_gac.zoo import ALGORITHMS, HYPERPARAMS, convert, sample_asymmetric_sac, sample_gac, with_hyperparameters
 
 ENV = "sb3_gac/InvertedDoublePendulum-v5"
 QUICK = ["learning_starts:20", "batch_size:8", "policy_kwargs:dict(net_arch=[8])", "n_envs:1", "gradient_steps:1"]
@@ -127,3 +127,20 @@ def test_every_registered_task_has_hyperparameters():
         settings = yaml.safe_load((HYPERPARAMS / f"{algorithm}.yml").read_text())
         assert {f"sb3_gac/{task}-v5" for task in envs.mujoco.TASKS} <= set(settings)
         assert Path(HYPERPARAMS / f"{algorithm}.yml").is_file()
+
+
+def test_every_argument_that_is_sampled_is_used():
+    class Trial:
+        """Gives the lower end of what it is asked for, or the first choice."""
+
+        def suggest_float(self, name, low, high, log):
+            return low
+
+        suggest_int = staticmethod(lambda name, low, high: low)
+        suggest_categorical = staticmethod(lambda name, choices: choices[0])
+
+    shared = {"gamma", "learning_rate", "batch_size", "tau", "target_entropy", "policy_kwargs"}
+    of_gac, of_sac = (sample(Trial(), 1, 1, {}) for sample in (sample_gac, sample_asymmetric_sac))
+    assert set(of_sac) == shared
+    assert set(of_gac) == shared | {"target_kl", "kl_coef_learning_rate"}
+    assert (of_gac["gamma"], of_gac["batch_size"], of_gac["target_kl"]) == (0.999, 64, 3e-4)

@@ -295,3 +295,36 @@ def test_says_nothing_before_there_were_gradient_steps():
         _model(_vec_env(), learning_starts=100).learn(6, callback=callback)
     assert len(callback.history) == 3
     assert "kl" not in callback.history[-1]
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_both_policies_act_as_they_are_asked_to(deterministic):
+    asked = []
+
+    class Noting(Scripted):
+        def predict(self, *args, deterministic=False, **kwargs):
+            asked.append(("learner", deterministic))
+            return super().predict(*args, **kwargs)
+
+        def predict_guider(self, *args, deterministic=False, **kwargs):
+            asked.append(("guider", deterministic))
+            return super().predict_guider(*args, **kwargs)
+
+    model = Noting()
+    model.actions = {"guider": 0.0, "learner": 0.0}
+    callback = _callback(_vec_env(), eval_freq=1, deterministic=deterministic)
+    callback.init_callback(model)
+    assert callback.on_step()
+    assert set(asked) == {("learner", deterministic), ("guider", deterministic)}
+
+
+@pytest.mark.parametrize("whose", ["guider", "learner"])
+def test_the_spread_of_either_policys_returns_may_explain_a_gap(whose):
+    steady = {"guider": np.full(4, 5.0), "learner": np.full(4, 3.0)}
+    callback = _callback(_vec_env(), patience=1)
+    callback.num_timesteps = 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        callback._warn_if_not_following(*(steady | {whose: steady[whose] + np.array([-8, 8, -8, 8])}).values())
+    with pytest.warns(UserWarning, match="the guider returns 5 and the learner 3"):
+        callback._warn_if_not_following(*steady.values())

@@ -28,6 +28,55 @@ def test_schedule(tmp_path):
     assert (resumed.num_timesteps, _steps(tmp_path)) == (100, [90, 60])
 
 
+class _LongAtFirst(TwoViewBandit):
+    """An episode of 35 steps, and then of 5."""
+
+    def __init__(self):
+        super().__init__(length=35)
+
+    def step(self, action):
+        result = super().step(action)
+        self.length = 5 if result[2] else self.length
+        return result
+
+
+def test_after_a_late_checkpoint_the_next_one_is_as_many_steps_away(tmp_path):
+    model = small_model(_LongAtFirst(), train_freq=(1, "episode"))
+    model.learn(70, callback=ExactCheckpointCallback(tmp_path, every=10, keep=9))
+    assert _steps(tmp_path) == [65, 55, 45, 35]
+
+
+def test_an_error_after_a_signal_is_not_hidden_by_it(tmp_path):
+    """The process ends by the error, unless it is that of environments that the signal has ended."""
+
+    class Failing(TwoViewBandit):
+        def step(self, action):
+            os.kill(os.getpid(), signal.SIGTERM)
+            return super().step(action)
+
+    def fails(*scope):
+        raise RuntimeError("of another kind")
+
+    callback = [ExactCheckpointCallback(tmp_path, every=30), ConvertCallback(fails)]
+    with pytest.warns(UserWarning, match="SIGTERM"), pytest.raises(RuntimeError, match="of another kind"):
+        small_model(Failing()).learn(100, callback=callback)
+    assert _steps(tmp_path) == []
+
+
+def test_a_signal_that_an_earlier_training_did_not_get_to_is_forgotten(tmp_path):
+    class Signalling(TwoViewBandit):
+        def step(self, action):
+            if model.num_timesteps == 19:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return super().step(action)
+
+    model = small_model(Signalling())
+    callback = ExactCheckpointCallback(tmp_path, every=100)
+    with pytest.warns(UserWarning, match="SIGTERM"):
+        model.learn(20, callback=callback)
+    assert model.learn(20, callback=callback, reset_num_timesteps=False).num_timesteps == 40
+
+
 @pytest.mark.parametrize("argument", ["every", "keep"])
 def test_bad_arguments(argument, tmp_path):
     with pytest.raises(ValueError, match=f"{argument} must be at least 1, got 0"):

@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import warnings
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -24,8 +25,10 @@ from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNo
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, EnvironmentFailedError, GACShare, GACWithoutQ, InvalidStepError
+from sb3_gac.checks import processes
 from sb3_gac.checks.environments import guard_of
-from sb3_gac.checks.processes import WatchedPipe
+from sb3_gac.checks.processes import WatchedPipe, end_processes
+from sb3_gac.checks.uses import SuspiciousEnds
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from tests.diary import Diary, DiaryEnv, assert_true_and_whole, stored_transitions
 from tests.helpers import TwoViewBandit, small_model
@@ -143,18 +146,20 @@ def test_a_new_training_begins_with_a_rollout_of_its_own():
     assert starts == [0, 0, 6]
 
 
-def test_episodes_and_logs_are_counted(tmp_path):
+@pytest.mark.parametrize(("log_interval", "steps"), [(3, ["16", "30", "40"]), (4, ["20", "40"]), (8, ["40"])])
+def test_episodes_and_logs_are_counted(log_interval, steps, tmp_path):
+    """Where two episodes end at once, either may be the one after which a log is due."""
     from stable_baselines3.common.logger import configure
 
     model = _model(Diary().envs(2, length=4))  # episodes of four and of five steps
     logger = configure(str(tmp_path), ["csv"])
     model.set_logger(logger)
-    model.learn(40, log_interval=3)  # ends at steps 4, 5, 8, 10, 12, 15, 16, 20 and 20
+    model.learn(40, log_interval=log_interval)  # ends at steps 4, 5, 8, 10, 12, 15, 16, 20 and 20
     assert model._episode_num == 9
     lines = (tmp_path / "progress.csv").read_text().splitlines()
     columns = lines[0].split(",")
     logged = [dict(zip(columns, line.split(","), strict=True)) for line in lines[1:]]
-    assert [row["time/total_timesteps"] for row in logged] == ["16", "30", "40"]
+    assert [row["time/total_timesteps"] for row in logged] == steps
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
@@ -342,6 +347,40 @@ def test_a_message_that_was_cut_in_two_ends_the_pipe(what):
         pipe.send("reset")
 
 
+class _FakeProcess:
+    """Has ended with an exit code, of which the parent knows once it has waited; or lives, until it is killed."""
+
+    def __init__(self, code):
+        self.code, self.exitcode, self.alive, self.sentinel = code, None, code is None, self
+
+    def terminate(self):
+        """It does not listen."""
+
+    def join(self, timeout):
+        pass
+
+    def kill(self):
+        self.alive = False
+
+
+@pytest.mark.parametrize(
+    ("torn", "said"), [((), "environment 1 (exit code -9) died"), ((0,), "environment 0 was interrupted")]
+)
+def test_who_has_died_is_waited_for_and_all_others_end(torn, said, monkeypatch):
+    def wait(sentinels, timeout):
+        for process in sentinels:
+            process.exitcode = process.code
+
+    monkeypatch.setattr(processes, "wait", wait)
+    remotes = [SimpleNamespace(torn=index in torn, close=lambda: None) for index in range(2)]
+    env = SimpleNamespace(remotes=remotes, processes=[_FakeProcess(None), _FakeProcess(-9)])
+    assert said in end_processes(env)
+    assert not any(process.alive for process in env.processes)
+    assert (env.waiting, env.closed) == (False, True)
+    env.processes[1].exitcode = -9  # one that was known to have died comes before what was interrupted
+    assert "environment 1 (exit code -9) died" in end_processes(env)
+
+
 # --- somebody else uses the environments -----------------------------------------------------------------------------------
 
 
@@ -504,6 +543,47 @@ def test_steps_of_others_count_as_resets_do():
     assert guard.uses == 2
 
 
+def test_steps_of_others_count_in_processes_as_well():
+    env = SubprocVecEnv([lambda: DiaryEnv(Diary())], start_method="fork")
+    guard = guard_of(_model(env).get_env())
+    env.reset()
+    assert guard.uses == 1
+    env.step(np.zeros((1, 2)))
+    assert guard.uses == 2
+    env.close()
+
+
+def test_an_environment_in_two_vectorised_ones_ends_well_in_both():
+    inner = _Aliased(Diary(), length=3)
+    both = [DummyVecEnv([lambda: inner]) for _ in range(2)]
+    for env in both:
+        _model(env)
+    for env in [*both, both[0]]:
+        env.reset()
+        finals = [env.step(np.zeros((1, 2)))[3][0].get("terminal_observation") for _ in range(3)]
+        assert finals[:2] == [None, None]
+        assert finals[2]["partial"][2] == 3
+
+
+def test_equal_ends_must_be_in_a_row_to_be_suspicious(recwarn):
+    ends = SuspiciousEnds()
+    value = 0.0
+
+    def end(is_equal):
+        nonlocal value
+        ends.look_at({"partial": np.float32([[value]])}, np.array([False]), [{}])
+        value += 1
+        final = {"partial": np.float32([value if is_equal else value + 0.5])}
+        ends.look_at({"partial": np.float32([[value]])}, np.array([True]), [{"terminal_observation": final}])
+        value += 1
+
+    for is_equal in [True] * 4 + [False] + [True] * 4:
+        end(is_equal)
+    assert not recwarn
+    with pytest.warns(UserWarning, match="each of the last 5 episodes"):
+        end(True)
+
+
 def test_one_that_does_so_in_another_process_is_said():
     env = SubprocVecEnv([lambda: _Aliased(Diary())], start_method="fork")
     with pytest.warns(UserWarning, match=r"last observation of each of the last 5 episodes is the first one of the next"):
@@ -528,7 +608,8 @@ class _Infos(VecEnvWrapper):
     """
     Tells of episodes' ends in one of several ways.
 
-    :param how: "missing", "kept" (the same dicts in each step, told in even episodes only), "left" (never removed), "shared"
+    :param how: "missing", "kept" (the same dicts in each step, told in even episodes only), "left" (never removed), "half"
+        (the time limit alone never removed), "shared"
     """
 
     def __init__(self, venv, how):
@@ -548,7 +629,9 @@ class _Infos(VecEnvWrapper):
         for kept, info, done in zip(self.kept, infos, dones, strict=True):
             final = info.pop("terminal_observation", None)
             truncated = info.pop("TimeLimit.truncated")
-            if done and (self.how == "left" or (self.how == "kept" and final["partial"][1] % 2 == 0)):
+            if self.how == "half":
+                kept.pop("terminal_observation", None)
+            if done and (self.how in ("left", "half") or (self.how == "kept" and final["partial"][1] % 2 == 0)):
                 kept["terminal_observation"] = final
             if truncated:
                 kept["TimeLimit.truncated"] = True
@@ -587,10 +670,11 @@ class _Mixed(DiaryEnv):
 
 @kinds
 @pytest.mark.parametrize("normalized", [False, True])
-def test_what_was_left_in_an_info_does_not_count(cls, policy, buffer, normalized):
+@pytest.mark.parametrize("how", ["left", "half"])
+def test_what_was_left_in_an_info_does_not_count(cls, policy, buffer, normalized, how):
     """A time limit of an earlier episode, above all, must not make a later one bootstrap."""
     diary = Diary()
-    env = _Infos(DummyVecEnv([lambda: _Mixed(diary)] * 2), "left")
+    env = _Infos(DummyVecEnv([lambda: _Mixed(diary)] * 2), how)
     model = _model(VecNormalize(env) if normalized else env, cls, policy, buffer).learn(60)
     assert_true_and_whole(model, diary)
     assert {ended[4:] for ended in stored_transitions(model) if ended[4]} == {(True, False), (True, True)}

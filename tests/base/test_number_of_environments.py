@@ -119,6 +119,16 @@ def test_noise_made_for_several_environments_is_made_for_as_many_as_there_are():
     assert model.action_noise.n_envs == 2
 
 
+def test_noise_with_a_memory_begins_anew_with_other_environments():
+    model = small_model(_envs(2), action_noise=VectorizedActionNoise(NOISES["with a memory"](), 2))
+    model.action_noise.base_noise.noise_prev[:] = 1e6
+    model.set_env(_envs(3))
+    assert np.abs(model.action_noise()).max() < 100
+    model.action_noise.base_noise.noise_prev[:] = 1e6
+    model.set_env(_envs(1))
+    assert np.abs(model.action_noise()).max() < 100
+
+
 def test_a_buffer_that_was_taken_away_is_made_again():
     model = small_model(_envs(1)).learn(12)
     model.replay_buffer = None

@@ -135,6 +135,21 @@ def test_what_is_given_counts(how, cls, tmp_path):
     assert {name: read(again) for name, (_, read) in expected.items()} == given
 
 
+@pytest.mark.parametrize("how", HOW)
+def test_the_last_episodes_stay_as_far_as_there_is_room(how, tmp_path):
+    model = small_model().learn(20)
+    again = _again(how, model, tmp_path, stats_window_size=3)
+    assert list(again.ep_info_buffer) == list(model.ep_info_buffer)[-3:]
+    assert len(again.ep_info_buffer) == 3
+    assert list(_again(how, model, tmp_path, tau=0.1).ep_info_buffer) == list(model.ep_info_buffer)
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_policy_kwargs_that_are_new_are_refused_by_name(how, tmp_path):
+    with pytest.raises(ValueError, match=r"policy_kwargs can't be changed.*: n_critics is 3, and was None\."):
+        _again(how, small_model().learn(1), tmp_path, policy_kwargs={"net_arch": [16], "n_critics": 3})
+
+
 def test_another_seed_counts_and_the_same_one_changes_nothing(tmp_path):
     model = small_model(learning_starts=100).learn(20)
     draws = []
@@ -279,3 +294,13 @@ def test_a_subclass_that_hands_its_arguments_on(tmp_path):
     assert (resumed.gamma, resumed.weight, resumed.tau) == (0.8, 2.0, 0.1)
     with pytest.raises(TypeError, match=r'"gama", which is no argument of _HandsOn. Is "gamma" meant'):
         _HandsOn.load(tmp_path / "model", gama=0.5)
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+def test_a_policy_that_is_saved_by_itself_has_the_scales_that_were_given(cls, tmp_path):
+    again = _again("load", small_model(cls=cls), tmp_path, lr_scales={"critic": 3.0})
+    again.policy.save(tmp_path / "policy")
+    loaded = type(again.policy).load(tmp_path / "policy")
+    scales = [[optimizer.param_groups[0]["lr_scale"] for optimizer in optimizers_of(p)] for p in (again.policy, loaded)]
+    assert scales[0] == scales[1]
+    assert set(scales[1]) == {1.0, 3.0}

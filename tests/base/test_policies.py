@@ -6,7 +6,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare
-from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice, small_model
+from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice, optimizers_of, small_model
 
 IMAGE = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=spaces.Box(-1, 1, (2,), np.float32))
 CNN = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}, "share_features_extractor": True}
@@ -64,3 +64,26 @@ def test_a_residual_guiders_correction_starts_near_zero(env, guider, starts_at_t
         assert (parameter.abs().max() < 0.01 * 16**-0.5) == starts_at_the_learner
     if env is TwoViewBandit:
         assert head.log_std.weight.abs().max() > 0.5 * 16**-0.5
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+def test_a_policy_that_is_saved_by_itself_is_the_same_again(cls, tmp_path):
+    """With all that it was made with, whether a network shows it or not."""
+    options = {
+        "net_arch": [8, 4],
+        "activation_fn": th.nn.Tanh,
+        "log_std_bounds": (-3.0, -2.0),
+        "n_critics": 3,
+        "optimizer_class": th.optim.AdamW,
+        "optimizer_kwargs": {"weight_decay": 0.25},
+        "normalize_images": False,
+    }
+    policy = small_model(cls=cls, policy_kwargs=options).policy
+    policy.save(tmp_path / "policy")
+    again = type(policy).load(tmp_path / "policy")
+    assert _same(policy, again)
+    assert again.deployed.log_std_bounds == (-3.0, -2.0)
+    assert (again.deployed.activation_fn, again.n_critics, again.normalize_images) == (th.nn.Tanh, 3, False)
+    for optimizer in optimizers_of(again):
+        assert type(optimizer) is th.optim.AdamW
+        assert optimizer.param_groups[0]["weight_decay"] == 0.25

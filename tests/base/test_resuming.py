@@ -259,6 +259,34 @@ def test_episodes_that_cannot_be_gone_on_with_are_named(tmp_path):
     assert resumed.num_timesteps == 60
 
 
+def test_new_episodes_are_the_same_for_the_same_checkpoint_and_others_for_another(tmp_path):
+    class Unknown(gym.Wrapper):
+        pass
+
+    starts = []
+    for seed in (0, 1):
+        small_model(Unknown(TwoViewBandit(length=7)), seed=seed).learn(15).save_checkpoint(tmp_path / str(seed))
+        for _ in range(2):
+            with pytest.warns(UserWarning, match="New episodes start"):
+                resumed = GAC.resume(tmp_path / str(seed), Unknown(TwoViewBandit(length=7)), device="cpu")
+            resumed.learn(1, reset_num_timesteps=False)
+            starts.append(resumed.replay_buffer.observations["privileged"][15].item())
+    assert starts[0] == starts[1]
+    assert starts[2] == starts[3]
+    assert starts[0] != starts[2]
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_a_new_training_begins_with_new_noise_and_the_resumed_one_does_not(goes_on, tmp_path):
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.ones(1))
+    model = small_model(TwoViewBandit(length=100), action_noise=noise).learn(15)
+    model.action_noise.noise_prev[:] = 1e6
+    model.save_checkpoint(tmp_path)
+    resumed = GAC.resume(tmp_path, TwoViewBandit(length=100), device="cpu")
+    resumed.learn(3, reset_num_timesteps=not goes_on)
+    assert (np.abs(resumed.action_noise.noise_prev) > 1e5) == goes_on
+
+
 def test_subprocesses_start_new_episodes(tmp_path):
     env = SubprocVecEnv([TwoViewBandit] * 2)
     small_model(env).learn(30).save_checkpoint(tmp_path)

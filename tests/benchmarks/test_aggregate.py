@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 import benchmarks.aggregate
-from benchmarks.aggregate import choose_reference, compare, interval, run_scores, summarise_cells
+from benchmarks.aggregate import choose_reference, compare, interval, normalised_scores, run_scores, summarise_cells
 
 
 @pytest.fixture(autouse=True)
@@ -141,3 +141,15 @@ def test_runs_keep_their_order_whatever_a_machine_sorts_with():
     names = [f"a{number}" for number in np.random.default_rng(0).permutation(200)]
     tidy = pd.concat([_evaluations(name, 0, [0, 1]) for name in names])
     assert run_scores(tidy).algorithm.tolist() == names
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "low", "high"),
+    [([5.0, 1.0], [3.0, 9.0], 1.0, 9.0), ([5.0, 4.0], [9.0, 3.0], 3.0, 4.0), ([2.0, 6.0], [3.0, 5.0], 2.0, 6.0)],
+)
+def test_scores_lie_between_the_lowest_point_of_any_curve_and_the_best_end(one, other, low, high):
+    """Wherever the lowest point is: curves may fall."""
+    scores = normalised_scores(pd.concat([_evaluations("a", 0, one), _evaluations("b", 0, other)]))
+    assert scores.low.unique().tolist() == [low]
+    assert scores.high.unique().tolist() == [high]
+    assert scores.normalised.tolist() == pytest.approx([(end - low) / (high - low) for end in (one[-1], other[-1])])

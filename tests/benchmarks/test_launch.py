@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -138,3 +139,26 @@ def _read(path):
         return path.read_bytes()
     except OSError:  # it has ended
         return os.fsencode("")
+
+
+@pytest.mark.parametrize(("arguments", "at_once", "retries"), [([], 5, 1), (["--jobs", "2", "--retries", "4"], 2, 4)])
+@pytest.mark.parametrize("state", ["finished", "failed"])
+def test_the_command_line_counts(arguments, at_once, retries, state, tmp_path, monkeypatch, capsys):
+    launched = []
+
+    def launches(jobs, *options):
+        launched.append((len(jobs), *options))
+        for job in jobs:
+            job.state = "finished"
+        jobs[0].state = state
+
+    engine = SimpleNamespace(cpus=5)
+    monkeypatch.setattr(launch, "launch", launches)
+    monkeypatch.setattr(launch, "LocalEngine", lambda: engine)
+    monkeypatch.setattr(sys, "argv", ["launch", str(SMOKE), "--runs", str(tmp_path), *arguments])
+    with pytest.raises(SystemExit) as end:
+        launch.main()
+    assert launched == [(4, at_once, retries, engine)]
+    assert bool(end.value.code) == (state == "failed")
+    n_failed = int(state == "failed")
+    assert f"0 were finished before, {4 - n_failed} now, {n_failed} failed." in capsys.readouterr().out

@@ -3,10 +3,12 @@
 import json
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -14,18 +16,20 @@ import pandas as pd
 import pytest
 import torch as th
 import yaml
+from stable_baselines3.common.callbacks import ConvertCallback
 
 import benchmarks.config
 import benchmarks.run
 import benchmarks.suite
 from benchmarks.aggregate import finished_runs, origins
-from benchmarks.checkpoint import locked
+from benchmarks.checkpoint import SB3Checkpoints, checkpoints_of, locked
 from benchmarks.config import check_runs, environment, instantiate, read_algorithm, resolve
-from benchmarks.finished import name_of
+from benchmarks.finished import kind_of, name_of
 from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
 from benchmarks.suite import RunSpec, made_with, read_preset, read_suite
 from sb3_gac import GAC
+from tests.helpers import small_model
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "benchmarks" / "suites" / "smoke.yml"
@@ -337,6 +341,21 @@ def test_committed_results_count_for_the_same_settings_alone(tmp_path, change):
     assert (finished > 0) == (not change)
 
 
+def test_committed_results_count_for_the_same_arguments_alone(tmp_path):
+    """Those that a preset has now, though the suite is as it was."""
+    shutil.copy(RESULTS.with_suffix(".csv"), tmp_path / "results.csv")
+    results = json.loads(RESULTS.with_suffix(".json").read_text())
+    changed = next(iter(results["arguments"]))
+    results["arguments"][changed] = {**results["arguments"][changed], "tau": 0.4321}
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    before, after = (
+        [name_of(job.spec) for job in jobs_left(FIGURE, tmp_path, [path])[0]] for path in (RESULTS, tmp_path / "results")
+    )
+    again = {name_of(spec) for spec in read_suite(FIGURE) if kind_of(spec) == changed}
+    assert set(after) == set(before) | again
+    assert again - set(before)
+
+
 def test_what_is_missing_altogether_is_an_error_in_any_case(tmp_path):
     with pytest.raises(FileNotFoundError, match="4 runs are not finished"):
         finished_runs(SMOKE, tmp_path, complete_cells=True)
@@ -508,6 +527,72 @@ def test_a_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch, algorithm):
         resumed, model = (read_algorithm(algorithm)[0].load(path / "model") for path in (directory, undisturbed))
         assert all(th.equal(p, q) for p, q in zip(resumed.policy.parameters(), model.policy.parameters(), strict=True))
     assert {path.name for path in directory.iterdir()} == {path.name for path in undisturbed.iterdir()}
+
+
+class _Noted:
+    """In the place of one of SB3's algorithms: notes where it was loaded from, and which seed it got."""
+
+    num_timesteps = 200
+
+    @classmethod
+    def load(cls, path, **kwargs):
+        model = cls()
+        model.path = path
+        return model
+
+    def load_replay_buffer(self, path):
+        self.buffer_path = path
+
+    def set_random_seed(self, seed):
+        self.seed = seed
+
+
+def test_sb3s_runs_go_on_from_the_newest_checkpoint_with_numbers_that_were_not_drawn(tmp_path):
+    checkpoints = SB3Checkpoints(tmp_path)
+    assert checkpoints.resume(_Noted, {}, None, 3) is None
+    seeds = []
+    for name, history in (("checkpoint.old", [{"timesteps": 1}]), ("checkpoint", [{"timesteps": 2}])):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "history.json").write_text(json.dumps(history))
+        model, found = checkpoints.resume(_Noted, {}, None, 3)
+        assert (found, model.path, model.buffer_path) == (
+            history,
+            tmp_path / name / "model",
+            tmp_path / name / "replay_buffer.pkl",
+        )
+        seeds.append(model.seed)
+    assert seeds[0] == seeds[1]
+    for seed, steps in ((3, 400), (4, 200)):
+        model, _ = checkpoints.resume(type("Other", (_Noted,), {"num_timesteps": steps}), {}, None, seed)
+        seeds.append(model.seed)
+    assert len(set(seeds[1:])) == 3, "other numbers for another seed, and at another step"
+    assert not {0, 3, 4} & set(seeds), "nor those that the run began with"
+
+
+def test_a_run_leaves_signals_to_the_process(tmp_path):
+    """Told to end, it ends at once: a checkpoint between evaluations would shift those to come."""
+    seen, before = [], [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+    callback = checkpoints_of(GAC, tmp_path).callback(SimpleNamespace(history=[]), 1_000)
+    watch = ConvertCallback(lambda *_: seen.append([signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT)]) or True)
+    small_model().learn(2, callback=[callback, watch])
+    assert seen == [before, before]
+
+
+@pytest.mark.parametrize(("resumed", "seconds"), [(True, 130.0), (False, 30.0)])
+def test_seconds_are_those_of_the_processes_that_made_a_run(resumed, seconds, tmp_path, monkeypatch):
+    path = tmp_path / "timing.json"
+    path.write_text(json.dumps({"seconds": 100.0, "steps": 5, "learner": 0.0}))
+    clock = iter((1_000.0, 1_030.0))
+    monkeypatch.setattr(benchmarks.run, "time", SimpleNamespace(time=lambda: next(clock)))
+    watch = Stopwatch(path, SimpleNamespace(history=[{"learner": 2.5}]), resumed)
+    watch.model = SimpleNamespace(num_timesteps=10)
+    watch.write()
+    assert json.loads(path.read_text()) == {"seconds": seconds, "steps": 10, "learner": 2.5}
+
+
+@pytest.mark.parametrize(("steps", "size"), [(600, 1_000), (5_000, 5_000), (10**7, 10**6)])
+def test_a_buffer_holds_the_run_within_bounds(steps, size):
+    assert resolve(replace(read_suite(SMOKE)[0], steps=steps))[1]["buffer_size"] == size
 
 
 def test_what_is_left_of_a_finished_run_is_not_gone_on_with(tmp_path, monkeypatch):

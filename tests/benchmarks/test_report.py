@@ -1,6 +1,7 @@
 """Figure, page and tables, of the committed results and of made-up ones; test_page.py opens a page in a browser."""
 
 import json
+import os
 import re
 import shutil
 import sys
@@ -13,7 +14,8 @@ import benchmarks.aggregate
 from benchmarks.aggregate import compare, summarise_cells
 from benchmarks.report import interactive, main, palette
 
-RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
 COMMITTED = sorted(path.stem for path in RESULTS.glob("*.csv"))
 
 
@@ -38,7 +40,10 @@ def test_every_committed_result_can_be_reported(name, tmp_path, monkeypatch, cap
     page = (tmp_path / f"{name}.html").read_text()
     assert "python -m benchmarks.launch" in page
     assert not re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="http', page), "nothing is loaded from elsewhere"
-    first = json.loads((RESULTS / f"{name}.json").read_text())["cells"][0]
+    results = json.loads((RESULTS / f"{name}.json").read_text())
+    runs = os.path.relpath(ROOT / "benchmarks" / "runs", tmp_path)
+    assert all(f'<a href="{runs}/{run}">{run}</a>' in page for run in results["runs"]), "links lead from the page to the runs"
+    first = results["cells"][0]
     assert f"| {first['task']} | {first['noise']:g} | {first['algorithm']} |" in capsys.readouterr().out
 
 

@@ -140,3 +140,13 @@ def test_killed_at_any_moment_the_last_finished_one_is_there(delay, tmp_path):
     step = step_of(path)
     assert step in (finished[-1], finished[-1] + 1)
     assert files["state"] == str(step).encode() * 2_000
+
+
+def test_where_it_is_not_known_what_belongs_to_a_checkpoint_nothing_is_thrown_away(tmp_path):
+    _write(tmp_path, 1, block=b"a")
+    _truncate(_write(tmp_path, 2, block=b"b") / "manifest.json")
+    _write(tmp_path, 3, block=b"c")
+    assert sorted(path.read_bytes() for path in (tmp_path / "blocks").iterdir()) == [b"a", b"b", b"c"]
+    _write(tmp_path, 4, block=b"d")  # the damaged one is gone, and with it what is not known
+    assert [step_of(path) for path in checkpoints(tmp_path)] == [4, 3]
+    assert sorted(path.read_bytes() for path in (tmp_path / "blocks").iterdir()) == [b"c", b"d"]

@@ -69,6 +69,15 @@ def test_what_is_of_other_libraries_is_named(value):
         encode(value, {})
 
 
+def test_a_class_under_the_name_of_another_one_is_not_taken_for_it():
+    """What a file names must be what comes back."""
+    named_alike = type("ReLU", (), {"__module__": nn.ReLU.__module__, "__qualname__": "ReLU"})
+    assert _there_and_back(nn.ReLU) is nn.ReLU
+    for value in (named_alike, named_alike()):
+        with pytest.raises(UntrustedNameError, match="ReLU is not what is found under that name"):
+            encode(value, {})
+
+
 @pytest.mark.parametrize("name", ["os:system", "subprocess:Popen", "builtins:eval", "torch:load", "numpy:nothing"])
 @pytest.mark.parametrize("kind", ["class", "object"])
 def test_a_file_cannot_name_what_is_not_a_class_of_a_trusted_library(name, kind):

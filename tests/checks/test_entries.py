@@ -11,7 +11,8 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, Learner, export_learner
-from sb3_gac.networks.critics import EntryExtractor, module_names
+from sb3_gac.checks.entries import computable
+from sb3_gac.networks.encoders import EntryExtractor, module_names
 from tests.helpers import Sampled, TwoViewBandit, small_model
 
 VECTOR = spaces.Box(-1, 1, (2,), np.float32)
@@ -383,3 +384,11 @@ def test_the_learner_on_the_robot_refuses_choices_that_there_are_not(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             learner.act(given | changed)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.int8, np.int64, np.float16, np.bool_])
+def test_what_torch_computes_with_holds_the_same_numbers(dtype):
+    """The largest one above all."""
+    info = None if dtype is np.bool_ else (np.finfo if np.issubdtype(dtype, np.floating) else np.iinfo)(dtype)
+    values = np.array([0, 1] if info is None else [info.min, 0, info.max], dtype)
+    assert th.as_tensor(computable(values)).tolist() == values.tolist()

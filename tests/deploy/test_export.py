@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +19,7 @@ import sb3_gac
 from sb3_gac import GAC, AsymmetricSAC, DeploymentNormalizer, Learner, export_learner
 from sb3_gac.deploy.verification import ExportError, draw_observations
 from sb3_gac.envs import History
-from sb3_gac.networks.critics import VectorExtractor
+from sb3_gac.networks.encoders import VectorExtractor
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model, unlike_each_other
 from tests.sb3_contract.helpers import Renamed
 
@@ -206,6 +207,26 @@ def test_a_file_that_acts_otherwise_is_not_written(tmp_path):
         with pytest.raises(ExportError, match=rf"exported {name} differ from those of predict\(\) by up to \d"):
             export_learner(model, tmp_path / name)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_memory_that_is_not_carried_on_is_noticed(tmp_path, monkeypatch):
+    model = WITH_MEMORY["recurrent, continuous"]().learn(50)
+    unlike_each_other(model.policy)
+    monkeypatch.setattr(Learner, "_remembered", lambda self, n: np.zeros((n, self._memory["size"]), np.float32))
+    with pytest.raises(ExportError, match="differ from those of predict"):
+        export_learner(model, tmp_path / "learner.onnx")
+
+
+@pytest.mark.parametrize("kind", ["plain", "ranges"])
+@pytest.mark.parametrize(("error", "is_written"), [(1e-4, False), (2e-6, True)])
+def test_how_much_actions_may_differ(kind, error, is_written, tmp_path, monkeypatch):
+    """In units of half their range."""
+    model, act = KINDS[kind](), Learner.act
+    half = (model.action_space.high - model.action_space.low) / 2
+    monkeypatch.setattr(Learner, "act", lambda self, observation: act(self, observation) + error * half)
+    with nullcontext() if is_written else pytest.raises(ExportError):
+        export_learner(model, tmp_path / "learner.onnx")
+    assert (tmp_path / "learner.onnx").exists() == is_written
 
 
 class Branching(VectorExtractor):

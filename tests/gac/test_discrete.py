@@ -8,7 +8,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_gac import GAC, AsymmetricSAC
-from sb3_gac.networks.critics import DiscreteCriticEnsemble, VectorExtractor
+from sb3_gac.networks.critics import DiscreteCriticEnsemble
+from sb3_gac.networks.encoders import VectorExtractor
 from tests.helpers import TwoViewChoice, small_model
 
 ALGORITHMS = [GAC, AsymmetricSAC]

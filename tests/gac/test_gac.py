@@ -90,11 +90,11 @@ def test_targets_follow_at_their_interval():
     model = small_model(target_update_interval=3, learning_starts=1000)
     model.learn(30)
     updates = []
-    model.policy.update_targets = updates.append
+    model.policy.update_targets = lambda tau: updates.append((model._n_updates, tau))
     for _ in range(7):
         model.train(gradient_steps=1, batch_size=8)
     model.train(gradient_steps=2, batch_size=8)
-    assert updates == [model.tau] * 3, "counted over all gradient steps, not over those of one train()"
+    assert updates == [(n, model.tau) for n in (3, 6, 9)], "counted over all gradient steps, not over those of one train()"
 
 
 def test_target_kl_may_shrink_over_training():
@@ -103,6 +103,12 @@ def test_target_kl_may_shrink_over_training():
     assert model.current_target_kl == pytest.approx(0.002)
     model._current_progress_remaining = 0.75
     assert model.current_target_kl == pytest.approx(0.011)
+    violations, update = [], model.kl_coef_dual.update
+    model.kl_coef_dual.update = lambda violation, mask: violations.append(violation) or update(violation, mask)
+    model.train(gradient_steps=1, batch_size=8)
+    kl, target = (model.logger.name_to_value[f"train/{name}"] for name in ("kl", "target_kl"))
+    assert target == pytest.approx(0.011)
+    assert violations[0].mean().item() == pytest.approx(kl - 0.011, abs=1e-6), "kl_coef steers to the bound of the moment"
 
 
 @pytest.mark.parametrize(

@@ -28,3 +28,14 @@ def test_preset_merges_policy_kwargs_and_leaves_the_table_alone():
     assert "n_critics" not in preset("small")["policy_kwargs"]
     with pytest.raises(ValueError, match="preset must be one of"):
         preset("large")
+
+
+def test_who_changes_what_he_got_does_not_change_the_preset():
+    for name in ("small", "paper"):
+        arguments = preset(name)
+        before = repr(arguments)
+        for value in arguments.values():
+            if isinstance(value, dict):
+                value["more"] = 1
+                [layers.append(1) for layers in value.values() if isinstance(layers, list)]
+        assert repr(preset(name)) == before

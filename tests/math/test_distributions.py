@@ -190,3 +190,14 @@ def test_categorical_corrections_samples_and_modes():
     samples = Categorical(logits.detach().expand(20_000, 3)).sample()
     frequencies = th.bincount(samples, minlength=3) / 20_000
     th.testing.assert_close(frequencies, logits.detach().softmax(-1), rtol=0, atol=0.015)
+
+
+def test_diagnostics_of_states_by_themselves():
+    """Signs of means do not cancel each other, nor do logarithms of stds."""
+    gaussian = TanhGaussian(th.tensor([[3.0, -1.0], [0.5, 0.5]]), th.tensor([[1.0, 3.0], [2.0, 2.0]]).log())
+    assert {name: values.tolist() for name, values in gaussian.diagnostics().items()} == {
+        "std": pytest.approx([2.0, 2.0]),
+        "mean_abs": [2.0, 0.5],
+    }
+    categorical = Categorical(th.tensor([[0.7, 0.2, 0.1], [0.1, 0.1, 0.8]]).log())
+    assert categorical.diagnostics()["max_prob"].tolist() == pytest.approx([0.7, 0.8])

@@ -85,3 +85,16 @@ def test_bad_bounds_are_refused_by_name(bounds):
 def test_a_start_value_outside_the_bounds_is_refused():
     with pytest.raises(ValueError, match="outside kl_coef_bounds"):
         _kl_coef("auto_200")
+
+
+def test_goes_on_from_another_one_inside_its_own_bounds_and_at_its_own_rate():
+    other = make_coefficient("kl_coef", "auto_2", 1.0, (1e-4, 100.0), 0.5, CPU)
+    other.update(th.tensor([1.0]))
+    assert other.value.item() > 2
+    dual = make_coefficient("kl_coef", "auto", 1.0, (0.5, 1.5), 1e-3, CPU)
+    dual.go_on_from(other)
+    assert dual.value.item() == pytest.approx(1.5)
+    assert dual.optimizer.param_groups[0]["lr"] == 1e-3
+    state, gathered = (one.optimizer.state_dict()["state"][0] for one in (dual, other))
+    assert th.equal(state["exp_avg"], gathered["exp_avg"])
+    assert state["exp_avg"].item() != 0

@@ -264,10 +264,12 @@ def test_many_environments_end_at_once():
         np.testing.assert_array_equal(batch.next_observations["partial"][i], wanted[key][2]["next"]["partial"])
 
 
-def test_too_large_a_buffer_is_refused_with_the_numbers(monkeypatch):
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 10_000}))
-    with pytest.raises(MemoryError, match=r"10,000 transitions needs 0\.00 GB.*lower buffer_size to at most 222"):
-        _make(10_000, 1)
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_too_large_a_buffer_is_refused_with_the_numbers(n_envs, monkeypatch):
+    """Those of all environments together: a quarter of them would fit."""
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 200_000}))
+    with pytest.raises(MemoryError, match=r"10,000 transitions needs 0\.00 GB.*lower buffer_size to at most 4,444"):
+        _make(10_000 // n_envs, n_envs)
 
 
 @pytest.mark.parametrize("n_steps", [1, 3])
@@ -478,3 +480,16 @@ def _then_interrupt(method):
         raise KeyboardInterrupt
 
     return interrupted
+
+
+@pytest.mark.parametrize("n_added", [0, 1, 6, 7, 8, 9, 14, 15, 20])
+def test_a_restored_buffer_is_where_the_other_one_was(n_added):
+    """Seven transitions fit: before it is full, just when it is, and after."""
+    feeder, again = Feeder(_make(7, 2), 2, seed=1), _make(7, 2)
+    for _ in range(n_added):
+        feeder.step()
+    again.restore_bookkeeping(feeder.buffer.bookkeeping())
+    assert [(b.pos, b.full, b.size(), b.n_added) for b in (again,)] == [
+        (b.pos, b.full, b.size(), b.n_added) for b in (feeder.buffer,)
+    ]
+    assert again.full == (n_added >= 7)
