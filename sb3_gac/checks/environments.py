@@ -88,11 +88,14 @@ class EnvironmentGuard:
                     KeepingFinal.of(one).add(self.base, index)
         if isinstance(self.base, SubprocVecEnv) and not isinstance(self.base.remotes[0], WatchedPipe):
             self.base.remotes = tuple(map(WatchedPipe, self.base.remotes, self.base.processes))
+            self._close = self.base.close
+            vars(self.base)["close"] = self.close
 
     @property
     def uses(self) -> int:
-        """Steps and resets so far, of these vectorised environments or, in this process, of an environment in them."""
-        return self._calls + sum(use.count for use in self._uses_inside)
+        """Steps and resets so far, of these vectorised environments or of an environment in them."""
+        pipes = self.base.remotes if isinstance(self.base, SubprocVecEnv) else ()
+        return self._calls + sum(use.count for use in self._uses_inside) + sum(pipe.uses for pipe in pipes)
 
     # --- in the place of the environments' own ------------------------------------------------------------------------
 
@@ -133,6 +136,7 @@ class EnvironmentGuard:
         if not self._returns_new_arrays:
             rewards, dones = np.array(rewards), np.array(dones)
         self._check_observation(observation)
+        self._check_number(rewards, dones, infos)
         _check_rows('The "reward"', rewards, REWARD)
         self._check_ends(observation, dones, infos)
         return observation, rewards, dones, infos
@@ -152,20 +156,38 @@ class EnvironmentGuard:
                 _check_entries(entries, {key: entry}, index)
         self._save_obs(index, observation)
 
+    def close(self) -> None:
+        """Processes of which one has died, or was interrupted within a message, can't be told to end: they are ended."""
+        try:
+            self._close()
+        except (EOFError, OSError):
+            end_processes(self.base)  # type: ignore[arg-type]
+
     # --- checks -------------------------------------------------------------------------------------------------------
 
     def _check_observation(self, observation: Any) -> None:
         """One look at each entry of all environments together."""
         entries = entries_of(observation)
         for key, entry in self._entries.items():
+            if key not in entries:
+                raise InvalidStepError(
+                    f'The observation\'s entry "{key}" is missing, of all environments; nothing was stored. They returned '
+                    f"{list(entries)}. Check the wrappers around them; {GO_ON}."
+                )
             _check_rows(f'The observation\'s entry "{key}"', entries[key], entry)
+
+    def _check_number(self, rewards: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
+        """One reward, one end and one info of each environment: numpy would broadcast others."""
+        n_envs = self.env.num_envs
+        shapes = {"rewards": np.shape(rewards)[:1], "dones": np.shape(dones), "infos": (len(infos),)}
+        for name, shape in shapes.items():
+            if shape != (n_envs,):
+                raise InvalidStepError(
+                    f"{n_envs} environments returned {name} of shape {shape}; nothing was stored. Return one each. {GO_ON}."
+                )
 
     def _check_ends(self, observation: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
         """An info tells of an episode's end when there is one, and then of this one."""
-        if len(infos) != len(dones):
-            raise InvalidStepError(
-                f"{len(dones)} environments returned {len(infos)} info dicts; nothing was stored. Return one each. {GO_ON}."
-            )
         for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
             if done:
                 if FINAL not in info:

@@ -573,8 +573,43 @@ def test_as_many_infos_as_environments():
             observation, rewards, dones, infos = self.venv.step_wait()
             return observation, rewards, dones, infos[:1]
 
-    with pytest.raises(InvalidStepError, match="2 environments returned 1 info dicts"):
+    with pytest.raises(InvalidStepError, match=r"2 environments returned infos of shape \(1,\)"):
         _model(Fewer(Diary().envs(2), "")).learn(4)
+
+
+class _Changed(VecEnvWrapper):
+    """What a step returns goes through a function."""
+
+    def __init__(self, venv, change):
+        super().__init__(venv)
+        self.change = change
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.change(*self.venv.step_wait())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda o, r, d, i: (o, r[:1], d, i), r"2 environments returned rewards of shape \(1,\)"),
+        (lambda o, r, d, i: (o, r[0], d, i), r"2 environments returned rewards of shape \(\)"),
+        (lambda o, r, d, i: (o, r, d[:, None], i), r"2 environments returned dones of shape \(2, 1\)"),
+        (lambda o, r, d, i: (o, r, d[:1], i), r"2 environments returned dones of shape \(1,\)"),
+        (lambda o, r, d, i: ({"partial": o["partial"]}, r, d, i), r'entry "privileged" is missing.*\[\'partial\'\]'),
+        (lambda o, r, d, i: (o["partial"], r, d, i), r'entry "partial" is missing'),
+    ],
+)
+@pytest.mark.parametrize("normalized", [False, True])
+def test_what_is_not_there_for_each_environment_is_named(change, said, normalized):
+    """Numpy would give one reward to all of them."""
+    env = _Changed(Diary().envs(2), change)
+    model = _model(VecNormalize(env) if normalized else env)
+    with pytest.raises(InvalidStepError, match=said):
+        model.learn(4)
+    assert model.replay_buffer.size() == 0
 
 
 class _Mixed(DiaryEnv):
@@ -791,6 +826,47 @@ def test_what_is_changed_outside_vec_normalize_is_stored_as_it_is_seen(cls, buff
     }
 
 
+class _Bonus(VecEnvWrapper):
+    """Changes rewards, or ends all episodes after three steps and does not say where."""
+
+    def __init__(self, venv, bonus=0.0, limit=1000):
+        super().__init__(venv)
+        self.bonus, self.limit = bonus, limit
+
+    def reset(self):
+        self.left = self.limit
+        return self.venv.reset()
+
+    def step_wait(self):
+        observation, rewards, dones, infos = self.venv.step_wait()
+        self.left -= 1
+        return (observation, rewards + self.bonus, dones, infos) if self.left else (self.reset(), rewards, dones | True, infos)
+
+
+@kinds
+def test_rewards_that_are_changed_outside_vec_normalize_count(cls, policy, buffer):
+    diary = Diary()
+    model = _model(_Bonus(VecNormalize(diary.envs(2), norm_reward=False), 100.0), cls, policy, buffer).learn(24)
+    for row, t in enumerate(range(4)):
+        for env in range(2):
+            assert model.replay_buffer.rewards[row, env] == pytest.approx(diary.entries[env, 0, t][1] + 100)
+
+
+@kinds
+def test_rewards_that_are_changed_after_they_were_normalised_are_refused(cls, policy, buffer):
+    model = _model(_Bonus(VecNormalize(Diary().envs(2)), 100.0), cls, policy, buffer)
+    with pytest.raises(ValueError, match=r"_Bonus stands outside VecNormalize and changes rewards.*VecNormalize\(_Bonus\("):
+        model.learn(24)
+    assert model.replay_buffer.size() == 0
+
+
+def test_an_end_outside_vec_normalize_without_its_observation_is_named():
+    model = _model(_Bonus(VecNormalize(Diary().envs(2)), limit=3))
+    with pytest.raises(InvalidStepError, match=r'_Bonus ended an episode.*no "terminal_observation"'):
+        model.learn(24)
+    assert model.replay_buffer.size() == 2
+
+
 def test_wrappers_that_only_watch_change_nothing():
     diary = Diary()
     env = VecMonitor(VecNormalize(diary.envs(2)))
@@ -833,6 +909,17 @@ def test_goals_are_not_taken_from_another_episode():
     for _ in range(6):
         model.learn(1000, callback=_StopAfter(4))
     sample = model.replay_buffer.sample(400)
+    relabelled = (sample.observations["desired_goal"] != 50).flatten()
+    ahead = (sample.observations["desired_goal"] - sample.observations["observation"]).flatten()[relabelled]
+    assert relabelled.any()
+    assert ((ahead >= 1) & (ahead <= 6)).all()
+
+
+@pytest.mark.parametrize("steps", [13, 20, 26, 40])
+def test_goals_are_not_taken_from_another_episode_where_the_ring_begins_anew(steps):
+    model = _her_model(DummyVecEnv([_Goal]), buffer_size=20).learn(steps)
+    model.learn(8)
+    sample = model.replay_buffer.sample(1000)
     relabelled = (sample.observations["desired_goal"] != 50).flatten()
     ahead = (sample.observations["desired_goal"] - sample.observations["observation"]).flatten()[relabelled]
     assert relabelled.any()
