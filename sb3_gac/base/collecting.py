@@ -64,6 +64,8 @@ class DataCollection(OffPolicyAlgorithm):
         return None if self.env is None else self.replay_source.sampling_env
 
     def _check_replay_source(self, source: ReplaySource) -> None:
+        if self.replay_buffer is not None:
+            self._check_what_is_held(self.replay_buffer, source)
         if source.in_the_way is None:
             return
         names = f"{type(source.in_the_way).__name__} stands outside VecNormalize"
@@ -77,6 +79,21 @@ class DataCollection(OffPolicyAlgorithm):
             f"normalised with the newest statistics whenever they are sampled, {remedy}.",
             stacklevel=4,
         )
+
+    def _check_what_is_held(self, buffer: ReplayBuffer, source: ReplaySource) -> None:
+        """
+        :raises ValueError: if what is stored was normalised when it was seen, and what is to be stored is not, or the reverse
+        """
+        normalised = source.in_the_way is not None
+        held = getattr(buffer, "holds_normalised", normalised) if buffer.size() else normalised
+        if held != normalised:
+            ways = ("raw", "normalised as they were seen")
+            wrapper = f"{'no' if held else 'a'} wrapper outside VecNormalize changes them"
+            raise ValueError(
+                f"The replay buffer holds observations {ways[held]}, but of these environments it would get them "
+                f"{ways[normalised]}, because {wrapper}: wrap the environments as before, or leave the buffer out."
+            )
+        buffer.holds_normalised = normalised  # type: ignore[attr-defined]
 
     # --- episodes ---------------------------------------------------------------------------------------------------
 
@@ -210,6 +227,7 @@ class DataCollection(OffPolicyAlgorithm):
     ) -> None:
         assert isinstance(new_obs, dict)
         source = self.replay_source
+        self._check_what_is_held(replay_buffer, source)
         following = source.observation(new_obs)  # of the next episode where one has ended
         next_obs = {key: values.copy() for key, values in following.items()} if np.any(dones) else following
         for index in np.flatnonzero(dones):

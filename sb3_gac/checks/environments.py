@@ -69,8 +69,8 @@ class EnvironmentGuard:
 
     def __init__(self, env: VecEnv):
         self.env, self.base = env, env.unwrapped
-        self._entries = _entries_in(env.observation_space)
-        self._base_entries = _entries_in(self.base.observation_space)
+        self._entries = entries_in(env.observation_space)
+        self._base_entries = entries_in(self.base.observation_space)
         self._failure: str | None = None
         self._calls = 0
         self._uses_inside: list[EnvironmentUse] = []
@@ -107,7 +107,7 @@ class EnvironmentGuard:
         """
         self._calls += 1
         observation = self._own(self._call(self._reset))
-        self._check_observation(observation)
+        check_observation(observation, self._entries)
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -135,7 +135,7 @@ class EnvironmentGuard:
         observation = self._own(observation)
         if not self._returns_new_arrays:
             rewards, dones = np.array(rewards), np.array(dones)
-        self._check_observation(observation)
+        check_observation(observation, self._entries)
         self._check_number(rewards, dones, infos)
         _check_rows('The "reward"', rewards, REWARD)
         self._check_ends(observation, dones, infos)
@@ -164,17 +164,6 @@ class EnvironmentGuard:
             end_processes(self.base)  # type: ignore[arg-type]
 
     # --- checks -------------------------------------------------------------------------------------------------------
-
-    def _check_observation(self, observation: Any) -> None:
-        """One look at each entry of all environments together."""
-        entries = entries_of(observation)
-        for key, entry in self._entries.items():
-            if key not in entries:
-                raise InvalidStepError(
-                    f'The observation\'s entry "{key}" is missing, of all environments; nothing was stored. They returned '
-                    f"{list(entries)}. Check the wrappers around them; {GO_ON}."
-                )
-            _check_rows(f'The observation\'s entry "{key}"', entries[key], entry)
 
     def _check_number(self, rewards: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
         """One reward, one end and one info of each environment: numpy would broadcast others."""
@@ -276,10 +265,28 @@ class Entry(NamedTuple):
 REWARD = Entry.of(spaces.Box(-np.inf, np.inf, (), np.float32))
 
 
-def _entries_in(space: spaces.Space) -> dict[str, Entry]:
+def entries_in(space: spaces.Space) -> dict[str, Entry]:
     """Those of an observation's entries that are single arrays."""
     entries = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
     return {key: Entry.of(entry) for key, entry in entries.items() if entry.shape is not None}
+
+
+def check_observation(observation: Any, expected: dict[str, Entry]) -> None:
+    """
+    One look at each entry of all environments together.
+
+    :param observation: of all environments
+    :param expected: its entries
+    :raises InvalidStepError: naming the entry and the environment
+    """
+    entries = entries_of(observation)
+    for key, entry in expected.items():
+        if key not in entries:
+            raise InvalidStepError(
+                f'The observation\'s entry "{key}" is missing, of all environments; nothing was stored. They returned '
+                f"{list(entries)}. Check the wrappers around them; {GO_ON}."
+            )
+        _check_rows(f'The observation\'s entry "{key}"', entries[key], entry)
 
 
 def _check_entries(observation: Any, expected: dict[str, Entry], index: int, what: str = "The observation's entry") -> None:

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import (
     unwrap_vec_normalize,
 )
 
-from sb3_gac.checks.environments import FINAL, RAW_FINAL, InvalidStepError
+from sb3_gac.checks.environments import FINAL, RAW_FINAL, InvalidStepError, check_observation, entries_in
 
 Entries = dict[str, np.ndarray]
 #: Wrappers that hand on observations as they are
@@ -66,6 +66,8 @@ class ReplaySource:
         #: The wrapper because of which observations are stored as they are seen, ``None`` if there is none
         self.in_the_way = next((wrapper for wrapper in changing if type(wrapper) is not VecTransposeImage), None)
 
+        self._entries = entries_in(env.observation_space)
+
     @property
     def is_raw(self) -> bool:
         """Whether what is stored is still to be normalised."""
@@ -82,9 +84,13 @@ class ReplaySource:
         """
         :param seen: what the environments have just returned, (n_envs, ...) of each entry
         :return: what is to be stored of it; no later step changes these arrays
+        :raises InvalidStepError: if a wrapper outside ``VecNormalize`` made something of it that can't be stored
         """
-        if self.normalizer is None or not self.is_raw:
+        if self.in_the_way is not None:
+            check_observation(seen, self._entries)  # as the guard does beneath
+        if not self.is_raw:
             return {key: np.array(values) for key, values in seen.items()}
+        assert self.normalizer is not None
         return self._transposed(self.normalizer.get_original_obs())
 
     def final(self, info: Mapping[str, Any]) -> Mapping[str, np.ndarray]:

@@ -313,17 +313,17 @@ class _FakePipe:
 
     def recv(self):
         self._maybe("recv")
-        return f"answer to {self.requests.pop(0)}"
+        return f"answer to {self.requests.pop(0)[0]}"
 
 
 def test_a_pipe_throws_away_what_nobody_fetched():
     fake = _FakePipe()
     pipe = WatchedPipe(fake, None)
-    pipe.send("step 1")
+    pipe.send(("step", 1))
     fake.interrupt_at = "poll"
     with pytest.raises(KeyboardInterrupt):
         pipe.recv()
-    pipe.send("reset")
+    pipe.send(("reset", None))
     assert pipe.recv() == "answer to reset"
     assert pipe.recv() is None  # and does not wait for ever
 
@@ -333,13 +333,13 @@ def test_a_message_that_was_cut_in_two_ends_the_pipe(what):
     fake = _FakePipe()
     pipe = WatchedPipe(fake, None)
     if what == "recv":
-        pipe.send("step 1")
+        pipe.send(("step", 1))
     fake.interrupt_at = what
     with pytest.raises(KeyboardInterrupt):
-        pipe.send("step 1") if what == "send" else pipe.recv()
+        pipe.send(("step", 1)) if what == "send" else pipe.recv()
     assert pipe.torn
     with pytest.raises(EOFError):
-        pipe.send("reset")
+        pipe.send(("reset", None))
 
 
 # --- somebody else uses the environments -----------------------------------------------------------------------------------
@@ -863,6 +863,43 @@ def test_rewards_that_are_changed_after_they_were_normalised_are_refused(cls, po
 def test_an_end_outside_vec_normalize_without_its_observation_is_named():
     model = _model(_Bonus(VecNormalize(Diary().envs(2)), limit=3))
     with pytest.raises(InvalidStepError, match=r'_Bonus ended an episode.*no "terminal_observation"'):
+        model.learn(24)
+    assert model.replay_buffer.size() == 2
+
+
+@kinds
+def test_raw_and_normalised_observations_are_not_mixed(cls, policy, buffer, tmp_path):
+    """One of them would reach the networks as what it is not."""
+    diary = Diary()
+    make = [lambda: VecNormalize(diary.envs(2)), lambda: _Shifted(VecNormalize(diary.envs(2)))]
+    for before, after in (make, make[::-1]):
+        model = _model(before(), cls, policy, buffer).learn(12)
+        model.save(tmp_path / "model")
+        model.save_replay_buffer(tmp_path / "buffer")
+        with pytest.raises(
+            ValueError, match=r"replay buffer holds observations (raw|normalised).*wrap the environments as before"
+        ):
+            model.set_env(after())
+        loaded = cls.load(tmp_path / "model", env=after())
+        loaded.load_replay_buffer(tmp_path / "buffer")
+        with pytest.raises(ValueError, match=r"replay buffer holds observations (raw|normalised).*leave the buffer out"):
+            loaded.learn(4)
+        again = cls.load(tmp_path / "model", env=before())
+        again.load_replay_buffer(tmp_path / "buffer")
+        assert again.learn(4).replay_buffer.size() == 8
+        assert cls.load(tmp_path / "model", env=after()).learn(4).replay_buffer.size() == 2
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_is_named_outside_vec_normalize_too(value):
+    class Spoils(_Shifted):
+        def _shift(self, observation):
+            observation = super()._shift(observation)
+            observation["partial"][1, 0] = value if observation["partial"][1, 2] == 1003 else 0
+            return observation
+
+    model = _model(Spoils(VecNormalize(Diary().envs(2), norm_obs_keys=["privileged"])), learning_starts=1000)
+    with pytest.raises(InvalidStepError, match=r'entry "partial" of environment 1 holds NaN or infinite'):
         model.learn(24)
     assert model.replay_buffer.size() == 2
 
