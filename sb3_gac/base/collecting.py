@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self
 
-from sb3_gac.checks.environments import guard_environments, guard_of
+from sb3_gac.checks.environments import EnvironmentGuard, guard_environments, guard_of
 from sb3_gac.checks.requirements import check_environment
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.source import ReplaySource
@@ -32,8 +32,8 @@ class DataCollection(OffPolicyAlgorithm):
     #: Steps of each environment, and episodes, of the rollout under way
     _rollout_steps = 0
     _rollout_episodes = 0
-    #: What the guard had counted when the environments were last used from here
-    _uses_known = 0
+    #: Guard of the environments that were last used from here, and what it had counted by then
+    _last_use: tuple[EnvironmentGuard | None, int] = (None, 0)
     _replay_source: ReplaySource | None = None
     _used_elsewhere_said = False
 
@@ -64,6 +64,8 @@ class DataCollection(OffPolicyAlgorithm):
         return None if self.env is None else self.replay_source.sampling_env
 
     def _check_replay_source(self, source: ReplaySource) -> None:
+        if self.replay_buffer is not None:
+            self._check_what_is_held(self.replay_buffer, source)
         if source.in_the_way is None:
             return
         names = f"{type(source.in_the_way).__name__} stands outside VecNormalize"
@@ -77,6 +79,21 @@ class DataCollection(OffPolicyAlgorithm):
             f"normalised with the newest statistics whenever they are sampled, {remedy}.",
             stacklevel=4,
         )
+
+    def _check_what_is_held(self, buffer: ReplayBuffer, source: ReplaySource) -> None:
+        """
+        :raises ValueError: if what is stored was normalised when it was seen, and what is to be stored is not, or the reverse
+        """
+        normalised = source.in_the_way is not None
+        held = getattr(buffer, "holds_normalised", normalised) if buffer.size() else normalised
+        if held != normalised:
+            ways = ("raw", "normalised as they were seen")
+            wrapper = f"{'no' if held else 'a'} wrapper outside VecNormalize changes them"
+            raise ValueError(
+                f"The replay buffer holds observations {ways[held]}, but of these environments it would get them "
+                f"{ways[normalised]}, because {wrapper}: wrap the environments as before, or leave the buffer out."
+            )
+        buffer.holds_normalised = normalised  # type: ignore[attr-defined]
 
     # --- episodes ---------------------------------------------------------------------------------------------------
 
@@ -106,7 +123,7 @@ class DataCollection(OffPolicyAlgorithm):
         """The environments are about to be reset: what was stored last is not continued by what comes next."""
         if isinstance(self.replay_buffer, CompactDictReplayBuffer):
             self.replay_buffer.cut()
-        elif isinstance(self.replay_buffer, HerReplayBuffer) and self.replay_buffer.pos != 0:
+        elif isinstance(self.replay_buffer, HerReplayBuffer):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 self.replay_buffer.truncate_last_trajectory()
@@ -122,16 +139,19 @@ class DataCollection(OffPolicyAlgorithm):
     def _note_use(self) -> None:
         """Whatever was done to the environments so far was done from here."""
         assert self.env is not None
-        self._uses_known = guard_of(self.env).uses
+        guard = guard_of(self.env)
+        self._last_use = (guard, guard.uses)
 
     def _reset_if_used_elsewhere(self, env: VecEnv) -> None:
-        """Episodes under way end where somebody else has stepped or reset the environments."""
-        if guard_of(env).uses == self._uses_known:
+        """Episodes under way end where somebody else has stepped or reset the environments, or they are others than before."""
+        guard = guard_of(env)
+        if self._last_obs is not None and self._last_use == (guard, guard.uses):
             return
-        if not self._used_elsewhere_said:
+        if self._last_obs is not None and not self._used_elsewhere_said:
             warnings.warn(
-                "The training environments were stepped or reset from outside the training, as by an evaluation on them: the "
-                "episodes under way end there, and new ones start. Give evaluations an environment of their own.",
+                "The training environments were stepped or reset from outside the training, as by an evaluation on them, or "
+                "force_reset=False was given with others than before: the episodes under way end there, and new ones start. "
+                "Give evaluations an environment of their own.",
                 stacklevel=4,
             )
             self._used_elsewhere_said = True
@@ -156,6 +176,8 @@ class DataCollection(OffPolicyAlgorithm):
         callback.on_rollout_start()
         continue_training = True
         while continue_training and should_collect_more_steps(train_freq, self._rollout_steps, self._rollout_episodes):
+            if env is not self.env:  # a callback has set others
+                env, replay_buffer, action_noise = self.env, self.replay_buffer, self.action_noise  # type: ignore[assignment]
             self._reset_if_used_elsewhere(env)
             actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
             new_obs, rewards, dones, infos = env.step(actions)
@@ -205,6 +227,7 @@ class DataCollection(OffPolicyAlgorithm):
     ) -> None:
         assert isinstance(new_obs, dict)
         source = self.replay_source
+        self._check_what_is_held(replay_buffer, source)
         following = source.observation(new_obs)  # of the next episode where one has ended
         next_obs = {key: values.copy() for key, values in following.items()} if np.any(dones) else following
         for index in np.flatnonzero(dones):
@@ -215,4 +238,4 @@ class DataCollection(OffPolicyAlgorithm):
         self._last_obs, self._last_original_obs, self._last_episode_starts = new_obs, following, np.array(dones)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_replay_source", "_uses_known"]
+        return [*super()._excluded_save_params(), "_replay_source", "_last_use"]

@@ -9,6 +9,7 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self
 
 from sb3_gac.base.collecting import DataCollection
@@ -56,6 +57,8 @@ class FaultTolerance(DataCollection):
         super().set_env(env, force_reset)
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
+        if isinstance(self.replay_buffer, HerReplayBuffer):
+            self.replay_buffer.env = self.env  # which rewards goals: SB3 would ask the one before
         _ = self.replay_source  # which may refuse, or warn
 
     @classmethod
@@ -115,8 +118,10 @@ class FaultTolerance(DataCollection):
             environments filled it; the buffer stays what it was
         """
         before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        loaded, self.replay_buffer = self.replay_buffer, before
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+        finally:
+            loaded, self.replay_buffer = self.replay_buffer, before
         assert loaded is not None
         _check_spaces(self, loaded, "replay buffer")
         if self.env is not None:

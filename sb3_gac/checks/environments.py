@@ -69,8 +69,8 @@ class EnvironmentGuard:
 
     def __init__(self, env: VecEnv):
         self.env, self.base = env, env.unwrapped
-        self._entries = _entries_in(env.observation_space)
-        self._base_entries = _entries_in(self.base.observation_space)
+        self._entries = entries_in(env.observation_space)
+        self._base_entries = entries_in(self.base.observation_space)
         self._failure: str | None = None
         self._calls = 0
         self._uses_inside: list[EnvironmentUse] = []
@@ -88,11 +88,14 @@ class EnvironmentGuard:
                     KeepingFinal.of(one).add(self.base, index)
         if isinstance(self.base, SubprocVecEnv) and not isinstance(self.base.remotes[0], WatchedPipe):
             self.base.remotes = tuple(map(WatchedPipe, self.base.remotes, self.base.processes))
+            self._close = self.base.close
+            vars(self.base)["close"] = self.close
 
     @property
     def uses(self) -> int:
-        """Steps and resets so far, of these vectorised environments or, in this process, of an environment in them."""
-        return self._calls + sum(use.count for use in self._uses_inside)
+        """Steps and resets so far, of these vectorised environments or of an environment in them."""
+        pipes = self.base.remotes if isinstance(self.base, SubprocVecEnv) else ()
+        return self._calls + sum(use.count for use in self._uses_inside) + sum(pipe.uses for pipe in pipes)
 
     # --- in the place of the environments' own ------------------------------------------------------------------------
 
@@ -104,7 +107,7 @@ class EnvironmentGuard:
         """
         self._calls += 1
         observation = self._own(self._call(self._reset))
-        self._check_observation(observation)
+        check_observation(observation, self._entries)
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -132,7 +135,8 @@ class EnvironmentGuard:
         observation = self._own(observation)
         if not self._returns_new_arrays:
             rewards, dones = np.array(rewards), np.array(dones)
-        self._check_observation(observation)
+        check_observation(observation, self._entries)
+        self._check_number(rewards, dones, infos)
         _check_rows('The "reward"', rewards, REWARD)
         self._check_ends(observation, dones, infos)
         return observation, rewards, dones, infos
@@ -152,20 +156,27 @@ class EnvironmentGuard:
                 _check_entries(entries, {key: entry}, index)
         self._save_obs(index, observation)
 
+    def close(self) -> None:
+        """Processes of which one has died, or was interrupted within a message, can't be told to end: they are ended."""
+        try:
+            self._close()
+        except (EOFError, OSError):
+            end_processes(self.base)  # type: ignore[arg-type]
+
     # --- checks -------------------------------------------------------------------------------------------------------
 
-    def _check_observation(self, observation: Any) -> None:
-        """One look at each entry of all environments together."""
-        entries = entries_of(observation)
-        for key, entry in self._entries.items():
-            _check_rows(f'The observation\'s entry "{key}"', entries[key], entry)
+    def _check_number(self, rewards: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
+        """One reward, one end and one info of each environment: numpy would broadcast others."""
+        n_envs = self.env.num_envs
+        shapes = {"rewards": np.shape(rewards)[:1], "dones": np.shape(dones), "infos": (len(infos),)}
+        for name, shape in shapes.items():
+            if shape != (n_envs,):
+                raise InvalidStepError(
+                    f"{n_envs} environments returned {name} of shape {shape}; nothing was stored. Return one each. {GO_ON}."
+                )
 
     def _check_ends(self, observation: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
         """An info tells of an episode's end when there is one, and then of this one."""
-        if len(infos) != len(dones):
-            raise InvalidStepError(
-                f"{len(dones)} environments returned {len(infos)} info dicts; nothing was stored. Return one each. {GO_ON}."
-            )
         for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
             if done:
                 if FINAL not in info:
@@ -254,10 +265,28 @@ class Entry(NamedTuple):
 REWARD = Entry.of(spaces.Box(-np.inf, np.inf, (), np.float32))
 
 
-def _entries_in(space: spaces.Space) -> dict[str, Entry]:
+def entries_in(space: spaces.Space) -> dict[str, Entry]:
     """Those of an observation's entries that are single arrays."""
     entries = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
     return {key: Entry.of(entry) for key, entry in entries.items() if entry.shape is not None}
+
+
+def check_observation(observation: Any, expected: dict[str, Entry]) -> None:
+    """
+    One look at each entry of all environments together.
+
+    :param observation: of all environments
+    :param expected: its entries
+    :raises InvalidStepError: naming the entry and the environment
+    """
+    entries = entries_of(observation)
+    for key, entry in expected.items():
+        if key not in entries:
+            raise InvalidStepError(
+                f'The observation\'s entry "{key}" is missing, of all environments; nothing was stored. They returned '
+                f"{list(entries)}. Check the wrappers around them; {GO_ON}."
+            )
+        _check_rows(f'The observation\'s entry "{key}"', entries[key], entry)
 
 
 def _check_entries(observation: Any, expected: dict[str, Entry], index: int, what: str = "The observation's entry") -> None:

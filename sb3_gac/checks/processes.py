@@ -29,6 +29,8 @@ class WatchedPipe:
         self._awaits_answer = False
         #: Whether a message is under way, or was when an interrupt came
         self.torn = False
+        #: Steps and resets that were asked for, by whatever way
+        self.uses = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._pipe, name)
@@ -40,6 +42,7 @@ class WatchedPipe:
         """
         if self._awaits_answer:
             self.recv()
+        self.uses += _is_use(request)
         self._exchange(self._pipe.send, request)
         self._awaits_answer = True
 
@@ -68,6 +71,12 @@ class WatchedPipe:
             raise
         self.torn = False
         return result
+
+
+def _is_use(request: Any) -> bool:
+    """Whether SubprocVecEnv asks for a step or a reset: itself, or by ``env_method``."""
+    command, data = request
+    return (data[0] if command == "env_method" else command) in ("step", "reset")
 
 
 def end_processes(env: SubprocVecEnv) -> str:

@@ -71,6 +71,10 @@ class KeepingFinal:
             vars(env)["reset"] = cls(env.reset)
         return vars(env)["reset"]
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Of a copy of the environment it is not known where that will be held."""
+        return {"_reset": self._reset, "_places": []}
+
     def add(self, vec_env: DummyVecEnv, index: int) -> None:
         """
         :param vec_env: that holds the environment

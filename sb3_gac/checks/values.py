@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable, Mapping
-from numbers import Integral
+from decimal import Decimal
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ def described(error: Exception) -> str:
 
 def plain(value: Any, arrays: bool = False) -> Any:
     """
-    Python's own numbers in place of numpy's and torch's, also inside of dicts, lists and tuples.
+    Python's own numbers in place of numpy's, torch's and other libraries', also inside of dicts, lists and tuples.
 
     Files that hold others can't be read without executing what they say.
 
@@ -54,6 +55,8 @@ def plain(value: Any, arrays: bool = False) -> Any:
     if arrays and isinstance(value, (np.ndarray, th.Tensor)):
         numbers = value.tolist()
         return value.item() if np.size(numbers) == 1 else numbers
+    if isinstance(value, (Real, Decimal)) and type(value) not in (bool, int, float):  # fractions, members of an IntEnum
+        return int(value) if isinstance(value, Integral) else float(value)
     if isinstance(value, Mapping):
         return {plain(key): plain(part, arrays) for key, part in value.items()}
     if isinstance(value, (list, tuple)):

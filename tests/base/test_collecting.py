@@ -318,17 +318,17 @@ class _FakePipe:
 
     def recv(self):
         self._maybe("recv")
-        return f"answer to {self.requests.pop(0)}"
+        return f"answer to {self.requests.pop(0)[0]}"
 
 
 def test_a_pipe_throws_away_what_nobody_fetched():
     fake = _FakePipe()
     pipe = WatchedPipe(fake, None)
-    pipe.send("step 1")
+    pipe.send(("step", 1))
     fake.interrupt_at = "poll"
     with pytest.raises(KeyboardInterrupt):
         pipe.recv()
-    pipe.send("reset")
+    pipe.send(("reset", None))
     assert pipe.recv() == "answer to reset"
     assert pipe.recv() is None  # and does not wait for ever
 
@@ -338,13 +338,13 @@ def test_a_message_that_was_cut_in_two_ends_the_pipe(what):
     fake = _FakePipe()
     pipe = WatchedPipe(fake, None)
     if what == "recv":
-        pipe.send("step 1")
+        pipe.send(("step", 1))
     fake.interrupt_at = what
     with pytest.raises(KeyboardInterrupt):
-        pipe.send("step 1") if what == "send" else pipe.recv()
+        pipe.send(("step", 1)) if what == "send" else pipe.recv()
     assert pipe.torn
     with pytest.raises(EOFError):
-        pipe.send("reset")
+        pipe.send(("reset", None))
 
 
 class _FakeProcess:
@@ -656,8 +656,43 @@ def test_as_many_infos_as_environments():
             observation, rewards, dones, infos = self.venv.step_wait()
             return observation, rewards, dones, infos[:1]
 
-    with pytest.raises(InvalidStepError, match="2 environments returned 1 info dicts"):
+    with pytest.raises(InvalidStepError, match=r"2 environments returned infos of shape \(1,\)"):
         _model(Fewer(Diary().envs(2), "")).learn(4)
+
+
+class _Changed(VecEnvWrapper):
+    """What a step returns goes through a function."""
+
+    def __init__(self, venv, change):
+        super().__init__(venv)
+        self.change = change
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.change(*self.venv.step_wait())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda o, r, d, i: (o, r[:1], d, i), r"2 environments returned rewards of shape \(1,\)"),
+        (lambda o, r, d, i: (o, r[0], d, i), r"2 environments returned rewards of shape \(\)"),
+        (lambda o, r, d, i: (o, r, d[:, None], i), r"2 environments returned dones of shape \(2, 1\)"),
+        (lambda o, r, d, i: (o, r, d[:1], i), r"2 environments returned dones of shape \(1,\)"),
+        (lambda o, r, d, i: ({"partial": o["partial"]}, r, d, i), r'entry "privileged" is missing.*\[\'partial\'\]'),
+        (lambda o, r, d, i: (o["partial"], r, d, i), r'entry "partial" is missing'),
+    ],
+)
+@pytest.mark.parametrize("normalized", [False, True])
+def test_what_is_not_there_for_each_environment_is_named(change, said, normalized):
+    """Numpy would give one reward to all of them."""
+    env = _Changed(Diary().envs(2), change)
+    model = _model(VecNormalize(env) if normalized else env)
+    with pytest.raises(InvalidStepError, match=said):
+        model.learn(4)
+    assert model.replay_buffer.size() == 0
 
 
 class _Mixed(DiaryEnv):
@@ -875,6 +910,84 @@ def test_what_is_changed_outside_vec_normalize_is_stored_as_it_is_seen(cls, buff
     }
 
 
+class _Bonus(VecEnvWrapper):
+    """Changes rewards, or ends all episodes after three steps and does not say where."""
+
+    def __init__(self, venv, bonus=0.0, limit=1000):
+        super().__init__(venv)
+        self.bonus, self.limit = bonus, limit
+
+    def reset(self):
+        self.left = self.limit
+        return self.venv.reset()
+
+    def step_wait(self):
+        observation, rewards, dones, infos = self.venv.step_wait()
+        self.left -= 1
+        return (observation, rewards + self.bonus, dones, infos) if self.left else (self.reset(), rewards, dones | True, infos)
+
+
+@kinds
+def test_rewards_that_are_changed_outside_vec_normalize_count(cls, policy, buffer):
+    diary = Diary()
+    model = _model(_Bonus(VecNormalize(diary.envs(2), norm_reward=False), 100.0), cls, policy, buffer).learn(24)
+    for row, t in enumerate(range(4)):
+        for env in range(2):
+            assert model.replay_buffer.rewards[row, env] == pytest.approx(diary.entries[env, 0, t][1] + 100)
+
+
+@kinds
+def test_rewards_that_are_changed_after_they_were_normalised_are_refused(cls, policy, buffer):
+    model = _model(_Bonus(VecNormalize(Diary().envs(2)), 100.0), cls, policy, buffer)
+    with pytest.raises(ValueError, match=r"_Bonus stands outside VecNormalize and changes rewards.*VecNormalize\(_Bonus\("):
+        model.learn(24)
+    assert model.replay_buffer.size() == 0
+
+
+def test_an_end_outside_vec_normalize_without_its_observation_is_named():
+    model = _model(_Bonus(VecNormalize(Diary().envs(2)), limit=3))
+    with pytest.raises(InvalidStepError, match=r'_Bonus ended an episode.*no "terminal_observation"'):
+        model.learn(24)
+    assert model.replay_buffer.size() == 2
+
+
+@kinds
+def test_raw_and_normalised_observations_are_not_mixed(cls, policy, buffer, tmp_path):
+    """One of them would reach the networks as what it is not."""
+    diary = Diary()
+    make = [lambda: VecNormalize(diary.envs(2)), lambda: _Shifted(VecNormalize(diary.envs(2)))]
+    for before, after in (make, make[::-1]):
+        model = _model(before(), cls, policy, buffer).learn(12)
+        model.save(tmp_path / "model")
+        model.save_replay_buffer(tmp_path / "buffer")
+        with pytest.raises(
+            ValueError, match=r"replay buffer holds observations (raw|normalised).*wrap the environments as before"
+        ):
+            model.set_env(after())
+        loaded = cls.load(tmp_path / "model", env=after())
+        loaded.load_replay_buffer(tmp_path / "buffer")
+        with pytest.raises(ValueError, match=r"replay buffer holds observations (raw|normalised).*leave the buffer out"):
+            loaded.learn(4)
+        again = cls.load(tmp_path / "model", env=before())
+        again.load_replay_buffer(tmp_path / "buffer")
+        assert again.learn(4).replay_buffer.size() == 8
+        assert cls.load(tmp_path / "model", env=after()).learn(4).replay_buffer.size() == 2
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_is_named_outside_vec_normalize_too(value):
+    class Spoils(_Shifted):
+        def _shift(self, observation):
+            observation = super()._shift(observation)
+            observation["partial"][1, 0] = value if observation["partial"][1, 2] == 1003 else 0
+            return observation
+
+    model = _model(Spoils(VecNormalize(Diary().envs(2), norm_obs_keys=["privileged"])), learning_starts=1000)
+    with pytest.raises(InvalidStepError, match=r'entry "partial" of environment 1 holds NaN or infinite'):
+        model.learn(24)
+    assert model.replay_buffer.size() == 2
+
+
 def test_wrappers_that_only_watch_change_nothing():
     diary = Diary()
     env = VecMonitor(VecNormalize(diary.envs(2)))
@@ -917,6 +1030,17 @@ def test_goals_are_not_taken_from_another_episode():
     for _ in range(6):
         model.learn(1000, callback=_StopAfter(4))
     sample = model.replay_buffer.sample(400)
+    relabelled = (sample.observations["desired_goal"] != 50).flatten()
+    ahead = (sample.observations["desired_goal"] - sample.observations["observation"]).flatten()[relabelled]
+    assert relabelled.any()
+    assert ((ahead >= 1) & (ahead <= 6)).all()
+
+
+@pytest.mark.parametrize("steps", [13, 20, 26, 40])
+def test_goals_are_not_taken_from_another_episode_where_the_ring_begins_anew(steps):
+    model = _her_model(DummyVecEnv([_Goal]), buffer_size=20).learn(steps)
+    model.learn(8)
+    sample = model.replay_buffer.sample(1000)
     relabelled = (sample.observations["desired_goal"] != 50).flatten()
     ahead = (sample.observations["desired_goal"] - sample.observations["observation"]).flatten()[relabelled]
     assert relabelled.any()

@@ -1,7 +1,10 @@
 """Numbers of numpy and torch as arguments: Python's own inside, so that a file that was written can be read."""
 
+import enum
 import inspect
 from collections import namedtuple
+from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -16,6 +19,11 @@ from tests.helpers import Recall, TwoViewBandit, optimizers_of, small_model
 ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
 Pair = namedtuple("Pair", "low high")
 
+
+class _Choice(enum.IntEnum):
+    TWO = 2
+
+
 #: Values that are no number of Python's, and what they become
 FOREIGN = [
     (np.float64(0.5), 0.5),
@@ -27,6 +35,9 @@ FOREIGN = [
     (np.str_("auto"), "auto"),
     (np.array(0.5), 0.5),
     (th.tensor(0.5), 0.5),
+    (Fraction(1, 2), 0.5),
+    (Decimal("0.5"), 0.5),
+    (_Choice.TWO, 2),
     ({"a": [np.int64(1), (np.float32(2), {"b": np.array(3)})]}, {"a": [1, (2.0, {"b": 3})]}),
     (Pair(np.float64(1), 2), Pair(1.0, 2)),
 ]
@@ -38,6 +49,18 @@ def _types(value):
     if isinstance(value, list | tuple):
         return type(value), [_types(part) for part in value]
     return type(value)
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("number", [Fraction(1, 2), Decimal("0.5")])
+def test_numbers_of_pythons_other_types_are_saved_loaded_and_resumed(cls, number, tmp_path):
+    options = {"net_arch": [4], "optimizer_kwargs": {"weight_decay": number}}
+    model = small_model(cls=cls, lr_scales={"critic": number}, ent_coef=number, policy_kwargs=options).learn(20)
+    model.save(tmp_path / "model")
+    model.save_checkpoint(tmp_path / "checkpoints")
+    for again in (cls.load(tmp_path / "model"), cls.resume(tmp_path / "checkpoints", TwoViewBandit(), device="cpu")):
+        assert again.ent_coef_tensor.item() == 0.5
+        assert optimizers_of(again.policy)[0].param_groups[0]["weight_decay"] == 0.5
 
 
 @pytest.mark.parametrize(("value", "expected"), FOREIGN, ids=lambda value: repr(value)[:30])

@@ -41,6 +41,26 @@ def test_goal_environments(image):
     np.testing.assert_array_equal(action, model.predict(obs, deterministic=True)[0])
 
 
+class _Rewarding(BitFlippingEnv):
+    """Rewards with a number of its own, other goals too."""
+
+    def __init__(self, number, **kwargs):
+        super().__init__(n_bits=4, continuous=True, **kwargs)
+        self.number = number
+
+    def compute_reward(self, achieved_goal, desired_goal, _info):
+        return np.full(np.shape(achieved_goal)[:-1], float(self.number))
+
+
+def test_goals_are_rewarded_by_the_environments_that_the_model_has_now():
+    """Those before may have been closed."""
+    model = _make(make_vec_env(lambda: _Rewarding(1)), {"n_sampled_goal": 4}).learn(40)
+    model.set_env(make_vec_env(lambda: _Rewarding(2)))
+    rewards = model.replay_buffer.sample(200).rewards.unique()
+    assert 2 in rewards
+    assert model.learn(40, reset_num_timesteps=False)._n_updates > 0
+
+
 @pytest.mark.parametrize("strategy", ["final", "episode", "future"])
 def test_goal_selection_with_several_environments_and_noise(strategy):
     noise = NormalActionNoise(np.zeros(4), 0.1 * np.ones(4))
@@ -71,13 +91,13 @@ def test_full_buffer():
 
 
 def test_buffer_needs_an_environment(tmp_path):
-    model = _make(make_vec_env(_env)).learn(20)
+    model = _make(make_vec_env(_env)).learn(40)
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
-    loaded = GAC.load(tmp_path / "model")  # to act
-    assert loaded.replay_buffer is None
+    loaded = GAC.load(tmp_path / "model")  # acting does without
     with pytest.raises(AssertionError, match="HerReplayBuffer"):
         loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.replay_buffer is None
 
 
 # --- what it needs of an environment -------------------------------------------------------------------------------------
