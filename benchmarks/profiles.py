@@ -16,12 +16,12 @@ import sb3_gac
 from benchmarks.contenders import timer
 from benchmarks.models import make_model, matmul_rate, step_flops
 
-COMPILED = ("compilation.py", "on_inputs")
+COMPILED = ("optim/compile.py", "on_inputs")
 PARTS = {  # of a compiled gradient step -> file and function, none of which calls another
-    "optimisers": ("training.py", "_step"),  # the networks'; the dual variables have theirs among their own
-    "dual variables": ("dual.py", "update"),
-    "targets": ("policies.py", "update_targets"),
-    "sampling": ("buffers.py", "sample"),
+    "optimisers": ("base/update.py", "_step"),  # the networks'; the dual variables have theirs among their own
+    "dual variables": ("optim/coefficients.py", "update"),
+    "targets": ("base/policy.py", "update_targets"),
+    "sampling": ("replay/buffer.py", "sample"),
 }
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
@@ -31,6 +32,8 @@ def check_environment(env: GymEnv) -> None:
             f"env is one of gymnasium's vector environments ({type(env).__name__}), but SB3's algorithms take SB3's own, "
             "VecEnv: make it with stable_baselines3.common.env_util.make_vec_env(<id or class>, n_envs=...)."
         )
+    if not isinstance(env, (gym.Env, VecEnv)):
+        return  # SB3 says what it expects
     check_entries(env.observation_space)
     if isinstance(env.action_space, spaces.Box):
         check_box_actions(env.action_space)

@@ -118,7 +118,7 @@ def test_behind_vec_normalize(kind, cls, tmp_path):
 @algorithms
 def test_other_environments_take_the_place_of_the_first(kind, cls):
     model = _model(kind, cls).learn(22)  # in the middle of an episode
-    with pytest.raises(AssertionError, match="number of environments"):
+    with pytest.raises(AssertionError, match="filled by 2 environments, but the model has 3"):
         model.set_env(_env(kind, 3))
     model.set_env(_env(kind, seed=5))
     assert model._last_obs is None

@@ -145,7 +145,7 @@ def test_training_continues_without_resetting_the_timesteps():
 
 def test_model_learns_on_a_new_environment():
     model = make_gac().learn(30)
-    with pytest.raises(AssertionError, match="number of environments"):
+    with pytest.raises(AssertionError, match="filled by 1 environments, but the model has 2"):
         model.set_env(make_vec_env(pendulum, n_envs=2))
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         model.set_env(gym.make("Pendulum-v1"))
