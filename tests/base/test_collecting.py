@@ -546,10 +546,11 @@ def test_steps_of_others_count_as_resets_do():
 def test_steps_of_others_count_in_processes_as_well():
     env = SubprocVecEnv([lambda: DiaryEnv(Diary())], start_method="fork")
     guard = guard_of(_model(env).get_env())
-    env.reset()
-    assert guard.uses == 1
-    env.step(np.zeros((1, 2)))
-    assert guard.uses == 2
+    counts = [guard.uses]
+    for use in (env.reset, lambda: env.step(np.zeros((1, 2))), lambda: env.env_method("reset")):
+        use()
+        counts.append(guard.uses)
+    assert counts[0] < counts[1] < counts[2] < counts[3]
     env.close()
 
 
