@@ -267,7 +267,7 @@ def test_new_episodes_are_the_same_for_the_same_checkpoint_and_others_for_anothe
     for seed in (0, 1):
         small_model(Unknown(TwoViewBandit(length=7)), seed=seed).learn(15).save_checkpoint(tmp_path / str(seed))
         for _ in range(2):
-            with pytest.warns(UserWarning, match="New episodes start"):
+            with pytest.warns(UserWarning, match="Starting new episodes"):
                 resumed = GAC.resume(tmp_path / str(seed), Unknown(TwoViewBandit(length=7)), device="cpu")
             resumed.learn(1, reset_num_timesteps=False)
             starts.append(resumed.replay_buffer.observations["privileged"][15].item())
