@@ -12,6 +12,7 @@ import ast
 import multiprocessing
 import os
 import queue
+import random
 import shutil
 import signal
 import sys
@@ -196,7 +197,9 @@ def is_killed(tree: Path, mutant: Mutant, timeout: float) -> bool:
     return status != _PASSED
 
 
-def run_mutants(mutants: Sequence[Mutant], jobs: int, timeout: float, root: Path = ROOT) -> list[Mutant]:
+def run_mutants(
+    mutants: Sequence[Mutant], jobs: int, timeout: float, root: Path = ROOT, tests_pass: bool = False
+) -> list[Mutant]:
     """
     Run the tests of each mutant, and say how it goes.
 
@@ -204,6 +207,7 @@ def run_mutants(mutants: Sequence[Mutant], jobs: int, timeout: float, root: Path
     :param jobs: how many at once, each in a copy of its own
     :param timeout: for the tests of one mutant, in seconds
     :param root: of the tree
+    :param tests_pass: whether it is known that the tests pass without a mutant
     :return: those that survived
     :raises MutantError: if a mutant can't be put in, or its tests fail without it
     """
@@ -216,10 +220,11 @@ def run_mutants(mutants: Sequence[Mutant], jobs: int, timeout: float, root: Path
             trees.put(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mutants-"))))
             copy_tree(root, trees.queue[-1])
         tests = sorted({test for mutant in mutants for test in mutant.tests})
-        print(f"Without a mutant: {len(tests)} tests or files of tests ...", flush=True)
-        status, output = run_tests(trees.queue[0], tests, max(timeout * len(tests), 600))
-        if status != _PASSED:
-            raise MutantError(f"Tests fail without a mutant, so they can't tell:\n{output[-4000:]}")
+        if not tests_pass:
+            print(f"Without a mutant: {len(tests)} tests or files of tests ...", flush=True)
+            status, output = run_tests(trees.queue[0], tests, max(timeout * len(tests), 600))
+            if status != _PASSED:
+                raise MutantError(f"Tests fail without a mutant, so they can't tell:\n{output[-4000:]}")
 
         def judged(mutant: Mutant) -> tuple[bool, float]:
             tree, start = trees.get(), time.perf_counter()
@@ -251,14 +256,18 @@ def main(arguments: Sequence[str] | None = None, root: Path = ROOT) -> int:
     parser.add_argument("--jobs", type=int, default=1, help="how many at once (default: 1)")
     parser.add_argument("--only", default="", help="those alone whose file, fault or tests hold this text")
     parser.add_argument("--least", type=float, default=95.0, help="percentage that must be killed (default: 95)")
+    parser.add_argument("--sample", type=int, help="so many of them, drawn by chance, always the same ones")
+    parser.add_argument("--tests-pass", action="store_true", help="they were just run: do not run them without a mutant first")
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds for one mutant's tests (default: 120)")
     options = parser.parse_args(arguments)
     mutants = [m for m in listed_mutants(root) if options.only in " ".join([m.name, m.old, m.new, *m.tests])]
     if not mutants:
         print(f"No mutant has {options.only!r} in it.")
         return 2
+    if options.sample is not None:
+        mutants = random.Random(0).sample(mutants, min(options.sample, len(mutants)))
     try:
-        survivors = run_mutants(mutants, options.jobs, options.timeout, root)
+        survivors = run_mutants(mutants, options.jobs, options.timeout, root, options.tests_pass)
     except MutantError as error:
         print(error)
         return 2

@@ -97,3 +97,15 @@ def test_what_tells_nothing_is_an_error(mutants, arguments, test, message, tmp_p
     _project(tmp_path, mutants, test)
     assert main(arguments, tmp_path) == 2
     assert message in capsys.readouterr().out
+
+
+def test_a_sample_is_the_same_each_time(tmp_path, capsys):
+    _project(tmp_path, [("a - b", "subtracts"), ("b - a", "the other way"), ("a * b", "multiplies"), ("a / b", "divides")])
+    drawn = []
+    for _ in range(2):
+        assert main(["--sample", "2", "--tests-pass"], tmp_path) == 0
+        printed = capsys.readouterr().out
+        assert "2 of 2 mutants killed" in printed
+        assert "Without a mutant" not in printed
+        drawn.append({line.split("s  ")[1] for line in printed.splitlines() if "killed" in line and "s  " in line})
+    assert drawn[0] == drawn[1]
