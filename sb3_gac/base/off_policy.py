@@ -18,7 +18,7 @@ from typing_extensions import Self
 from sb3_gac.base.overrides import algorithm_of
 from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
 from sb3_gac.base.resuming import ResumableAlgorithm
-from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_role_keys
+from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_rnn_types, resolve_role_keys
 from sb3_gac.base.strict_predict import DeploymentGuard
 from sb3_gac.checks.arguments import (
     KEPT_AS,
@@ -32,6 +32,7 @@ from sb3_gac.checks.requirements import check_goals, check_rewards_of_goals
 from sb3_gac.checks.values import plain
 from sb3_gac.networks.heads import check_action_space, resolve_target_entropy
 from sb3_gac.optim.coefficients import Coefficient, DualVariable, make_coefficient
+from sb3_gac.optim.compile import check_can_compile
 from sb3_gac.optim.parallel import has_side_effects
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.episodes import EpisodeReplayBuffer, check_learns_from_sequences
@@ -91,6 +92,7 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
     restored_arguments: ClassVar[tuple[str, ...]] = ("ent_coef", "lr_scales", "stats_window_size")
     policy_class: type[AsymmetricPolicy]
     policy: AsymmetricPolicy
+    ent_coef_dual: Coefficient
 
     def __init__(
         self,
@@ -180,7 +182,7 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         self._check_arguments()
         self.algorithm = algorithm_of(type(self))  # so that a file says whose it is
         if self.replay_buffer_class is None:
-            self.replay_buffer_class = CompactDictReplayBuffer if self.policy_class.cell is None else EpisodeReplayBuffer
+            self.replay_buffer_class = EpisodeReplayBuffer if self.is_recurrent else CompactDictReplayBuffer
         self._fit_action_noise()
         if self.replay_buffer is None and self.env is not None:  # to act takes no memory for training
             self.replay_buffer = self._make_replay_buffer()
@@ -194,16 +196,36 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
             super()._setup_model()
         finally:
             self.__dict__.update(as_given)  # saved as the user gave them
-        self._halves_are_independent = (
-            self.device.type == "cpu" and self.policy.halves_are_independent and not has_side_effects(self.policy)
+        side_effects = has_side_effects(self.policy)
+        self._branches_are_independent = (
+            self.device.type == "cpu" and self.policy.branches_are_independent and not side_effects
         )
-        if self.compile and has_side_effects(self.policy):
-            raise ValueError("compile=True can't do dropout or batch normalisation: leave them out, or leave it False.")
-        self._setup_coefficients()
+        if self.compile:
+            self._check_can_compile(side_effects)
+        self._update_every: dict[str, int] = {}
+        self.coefficients = self.make_coefficients()
+        self._keep_coefficients()
         self.programs = {}
         self._behaviour_state: BehaviourState = None
         if self.env is not None:
             _ = self.replay_source  # which may refuse, or warn
+
+    @property
+    def is_recurrent(self) -> bool:
+        """Whether a network has a memory, so that training takes sequences."""
+        rnn_type = (self.policy_kwargs or {}).get("rnn_type") or self.policy_class.default_rnn_type
+        return any(resolve_rnn_types(self.policy_class.roles, rnn_type).values())
+
+    def _check_can_compile(self, side_effects: bool) -> None:
+        if side_effects:
+            raise ValueError("compile=True can't do dropout or batch normalisation: leave them out, or leave it False.")
+        check_can_compile()
+        others = [name for name, network in self.policy.trained.items() if not network.can_be_compiled]
+        if others:
+            raise ValueError(
+                f"compile=True can do torch's Adam and AdamW without amsgrad, foreach or fused=False, but the optimiser of {others} "
+                f"is {type(self.policy.trained[others[0]].optimizer).__name__}: choose another optimizer_class, or leave it False."
+            )
 
     def _check_arguments(self) -> None:
         """
@@ -221,7 +243,7 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
         check_goals(self.replay_buffer_class, self.observation_space, self.env)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
-        if self.policy_class.cell is not None:
+        if self.is_recurrent:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
 
@@ -261,10 +283,18 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         """Arguments of the policy class that are arguments of the algorithm."""
         return {"role_keys": self.role_keys, "lr_scales": self.lr_scales}
 
-    def _setup_coefficients(self) -> None:
-        self.ent_coef_dual: Coefficient = make_coefficient(
-            "ent_coef", self.ent_coef, ENT_COEF_START, ENT_COEF_BOUNDS, self.lr_schedule(1), self.device
-        )
+    def make_coefficients(self) -> dict[str, Coefficient]:
+        """Name -> what a loss multiplies one of its terms with; the entropy temperature, in most algorithms."""
+        return {
+            "ent_coef": make_coefficient(
+                "ent_coef", self.ent_coef, ENT_COEF_START, ENT_COEF_BOUNDS, self.lr_schedule(1), self.device
+            )
+        }
+
+    def _keep_coefficients(self) -> None:
+        """Under the names that files know them by."""
+        for name, coefficient in self.coefficients.items():
+            setattr(self, f"{name}_dual", coefficient)
 
     # --- SB3's names ------------------------------------------------------------------------------------------------
 
@@ -300,8 +330,9 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
 
     def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
         """Optimisers that follow ``learning_rate``."""
-        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.flat_parameters]
-        return optimizers if self.ent_coef_optimizer is None else [*optimizers, self.ent_coef_optimizer]
+        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.trained]
+        temperature = self.coefficients.get("ent_coef")
+        return optimizers if temperature is None or temperature.optimizer is None else [*optimizers, temperature.optimizer]
 
     # --- acting -----------------------------------------------------------------------------------------------------
 
@@ -317,7 +348,7 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         :return: action for the environments, and the same scaled to [-1, 1] for the buffer
         """
         warms_up = self.num_timesteps < learning_starts
-        if warms_up and self.policy.cell is None:
+        if warms_up and not self.is_recurrent:
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, dict)
         scaled_action, self._behaviour_state = self.policy.behaviour_action(
@@ -380,36 +411,33 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         """
         if not given:
             return
-        before = {name: (getattr(self, name.removesuffix("_dual")), getattr(self, name)) for name in self._dual_names()}
+        before = {name: (getattr(self, name), coefficient) for name, coefficient in self.coefficients.items()}
         vars(self).update({KEPT_AS.get(name, name): value for name, value in given.items()})
         make_arguments_plain(self)
         self._check_arguments()
-        self._setup_coefficients()
+        self.coefficients = self.make_coefficients()
         for name, (spec, coefficient) in before.items():
-            argument = name.removesuffix("_dual")
-            spec_now = getattr(self, argument)
-            if not any(other.startswith(argument) for other in given):
-                setattr(self, name, coefficient)
+            spec_now = getattr(self, name)
+            if not any(other.startswith(name) for other in given):
+                self.coefficients[name] = coefficient
             elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, DualVariable)):
-                getattr(self, name).go_on_from(coefficient)
+                self.coefficients[name].go_on_from(coefficient)
+        self._keep_coefficients()
         if "lr_scales" in given:
             self.policy.scale_learning_rates(self._all_policy_kwargs()["lr_scales"])
         for buffer in ("ep_info_buffer", "ep_success_buffer"):
             if getattr(self, buffer) is not None:
                 setattr(self, buffer, deque(getattr(self, buffer), maxlen=self._stats_window_size))
 
-    def _dual_names(self) -> list[str]:
-        """Attributes that hold coefficients."""
-        return ["ent_coef_dual"]
-
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *self._dual_names(), "programs", "program_key"]
+        coefficients = [f"{name}_dual" for name in self.coefficients]
+        return [*super()._excluded_save_params(), *coefficients, "coefficients", "programs", "_program_key"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts = ["policy", *(f"policy.{name}.optimizer" for name in self.policy.flat_parameters)]
+        state_dicts = ["policy", *(f"policy.{name}.optimizer" for name in self.policy.trained)]
         tensors = []
-        for dual in self._dual_names():
-            dual_state_dicts, dual_tensors = getattr(self, dual).state_names
-            state_dicts += [f"{dual}.{name}" for name in dual_state_dicts]
-            tensors += [f"{dual}.{name}" for name in dual_tensors]
+        for name, coefficient in self.coefficients.items():
+            of_optimizers, of_tensors = coefficient.state_names
+            state_dicts += [f"{name}_dual.{attribute}" for attribute in of_optimizers]
+            tensors += [f"{name}_dual.{attribute}" for attribute in of_tensors]
         return state_dicts, tensors

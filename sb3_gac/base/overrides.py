@@ -19,7 +19,7 @@ def algorithm_of(kind: type) -> str:
     :param kind: an algorithm's class
     :return: name of the algorithm: that of this package which a subclass elsewhere adds to, or that subclass's first own
     """
-    concrete = [base for base in kind.__mro__ if hasattr(base, "_gradient_step") and not inspect.isabstract(base)]
+    concrete = [base for base in kind.__mro__ if hasattr(base, "update") and not inspect.isabstract(base)]
     ours = [base for base in concrete if base.__module__.partition(".")[0] == PACKAGE]
     return (ours or concrete[::-1])[0].__name__
 

@@ -1,6 +1,5 @@
 """What policies with a privileged view share: networks by role, target critics, optimisers; as a policy, the deployed one."""
 
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any, ClassVar, TypeAlias
@@ -8,6 +7,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name
@@ -17,40 +17,46 @@ from sb3_gac.base.roles import (
     DEFAULT_NET_ARCH,
     RoleKeys,
     Roles,
+    resolve_extractors,
     resolve_lr_scales,
     resolve_net_arch,
+    resolve_rnn_types,
     resolve_role_keys,
     role_space,
 )
 from sb3_gac.checks.entries import ObservationReader
 from sb3_gac.checks.values import check_integer
 from sb3_gac.math.distributions import Distribution
-from sb3_gac.networks.actors import BoundedPolicy, DeployedPolicy
+from sb3_gac.networks.actors import Actor, BoundedPolicy, DeployedPolicy, RolePolicy
 from sb3_gac.networks.critics import CriticEnsemble, DiscreteCriticEnsemble
 from sb3_gac.networks.encoders import EntryExtractor, VectorExtractor
+from sb3_gac.networks.heads import LOG_STD_BOUNDS
 from sb3_gac.networks.recurrent import Memory
-from sb3_gac.optim.flat import FlatAdam, FlatParameters, TrainedParameters
 from sb3_gac.optim.polyak import polyak_average
+from sb3_gac.optim.trained import TrainedParameters
 
-#: What each network of a behaviour policy remembers, shapes (B, S); ``None`` without memories, and before the first step
-BehaviourState: TypeAlias = tuple[np.ndarray, ...] | None
+#: What each policy's network remembers, shapes (B, S), ``None`` without a memory; ``None`` before the first step
+BehaviourState: TypeAlias = tuple[np.ndarray | None, ...] | None
 
 
 class AsymmetricPolicy(BoundedPolicy):
     """
-    Networks that read the observation entries of their roles, and their optimisers.
+    The networks of an algorithm's ``roles``, each reading the observation entries of its role, and their optimisers.
 
-    A subclass names its ``roles``, builds a network for each as the attribute of that name, with its target as
-    ``<name>_target`` where it is a critic, and then calls :meth:`_finish`.
+    Each network is the attribute of its role's name, and its target is ``<role>_target``. A subclass names its ``roles``; it
+    overrides :meth:`make_policy` where a policy is of another class, and :meth:`action_distributions` where policies act
+    relative to each other.
 
     :param observation_space: Dict
     :param action_space: Box or Discrete
+    :param lr_schedule: learning rate schedule
     :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}``, or one for each policy and one for "critic"
     :param activation_fn: between layers
     :param role_keys: role -> observation entries, see :func:`sb3_gac.base.roles.resolve_role_keys`
     :param lr_scales: network -> multiple of the learning rate, see :func:`sb3_gac.base.roles.resolve_lr_scales`
     :param n_critics: size of each critic ensemble
-    :param features_extractor_class: encoder, made once per role on the entries of that role
+    :param log_std_bounds: smallest and largest log standard deviation before tanh
+    :param features_extractor_class: encoder, made once per role on the entries of that role; or one for each role, by name
     :param features_extractor_kwargs: keyword arguments for it
     :param share_features_extractor: whether the other roles see the deployed policy's features of its entries, as they
         are, and encode only the other entries themselves; the deployed policy's loss trains that encoder (saves most
@@ -58,36 +64,41 @@ class AsymmetricPolicy(BoundedPolicy):
     :param normalize_images: divide images by 255
     :param optimizer_class: optimiser of policies and critics
     :param optimizer_kwargs: keyword arguments for it, without the learning rate
-    :param rnn_hidden_size: of recurrent policies: size of each network's recurrent layer, which comes after ``net_arch``
-    :param rnn_net_arch: of recurrent policies: hidden layer sizes after the recurrent layer
+    :param rnn_type: "gru" or "lstm" for networks that remember, and then take sequences; or role -> one of them, "critic"
+        standing for all critics, for a memory where it is needed; by default that of the policy class
+    :param rnn_hidden_size: of recurrent networks: size of the recurrent layer, which comes after ``net_arch``
+    :param rnn_net_arch: of recurrent networks: hidden layer sizes after the recurrent layer
     """
 
     roles: ClassVar[Roles]
-    #: "gru" or "lstm" for networks that remember, and then take sequences
-    cell: ClassVar[str | None] = None
+    #: Default of the argument of that name
+    default_rnn_type: ClassVar[str | None] = None
 
     def __init__(
         self,
         observation_space: spaces.Dict,
         action_space: spaces.Space,
+        lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.SiLU,
         role_keys: RoleKeys | None = None,
         lr_scales: Mapping[str, float] | None = None,
         n_critics: int = 2,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
+        features_extractor_class: type[BaseFeaturesExtractor] | Mapping[str, type[BaseFeaturesExtractor]] = CombinedExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = False,
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
+        rnn_type: str | Mapping[str, str] | None = None,
         rnn_hidden_size: int = 256,
         rnn_net_arch: Sequence[int] = (256,),
     ):
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class,
+            features_extractor_class,  # type: ignore[arg-type]
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -103,17 +114,72 @@ class AsymmetricPolicy(BoundedPolicy):
             "role_keys": role_keys,
             "lr_scales": lr_scales,
             "n_critics": n_critics,
+            "log_std_bounds": log_std_bounds,
             "share_features_extractor": share_features_extractor,
+            "rnn_type": rnn_type,
             "rnn_hidden_size": rnn_hidden_size,
             "rnn_net_arch": list(rnn_net_arch),
+            **self.own_options(),
         }
         self.reader = ObservationReader(observation_space)
         self.n_critics = n_critics
         self.share_features_extractor = share_features_extractor
         self.role_keys = resolve_role_keys(observation_space, self.roles, role_keys)
         self._role_net_arch = resolve_net_arch(self.roles, self.net_arch)
+        self._role_extractors = resolve_extractors(self.roles, features_extractor_class)
+        self.rnn_types = resolve_rnn_types(self.roles, rnn_type or self.default_rnn_type)
+        seen = {key for role in self.roles.policies for key in self.role_keys[role]}
+        self._acting_reader = ObservationReader(role_space(observation_space, [key for key in observation_space if key in seen]))
+        self._build_networks()
+        self._build_optimizers(lr_schedule)
+
+    def own_options(self) -> dict[str, Any]:
+        """Constructor arguments of a subclass, which it keeps before it calls this class's constructor."""
+        return {}
 
     # --- networks ---------------------------------------------------------------------------------------------------
+
+    def make_policy(self, role: str, **arguments: Any) -> RolePolicy:
+        """
+        :param role: deployed policy or another one
+        :param arguments: of its network
+        """
+        return (Actor if role == self.roles.deployed else RolePolicy)(**arguments)
+
+    def has(self, role: str) -> bool:
+        """Whether there is a network for the role, which an ablation may do without."""
+        return True
+
+    def _build_networks(self) -> None:
+        shared: BaseFeaturesExtractor | None = None
+        for role in self.roles.policies:
+            policy = self.make_policy(role, **self._role_kwargs(role, shared), log_std_bounds=self._log_std_bounds)
+            setattr(self, role, policy)
+            if role == self.roles.deployed and self.share_features_extractor:
+                shared = policy.features_extractor
+            if role in self.roles.target_policies:
+                self._set_target(role, deepcopy(policy))
+        ensemble = DiscreteCriticEnsemble if isinstance(self.action_space, spaces.Discrete) else CriticEnsemble
+        for role in self.roles.critics:
+            setattr(self, role, None)
+            setattr(self, f"{role}_target", None)
+            if self.has(role):
+                setattr(self, role, ensemble(**self._role_kwargs(role, shared), n_critics=self.n_critics))
+                self._set_target(role, ensemble(**self._role_kwargs(role, deepcopy(shared)), n_critics=self.n_critics))
+
+        pairs = self.pairs.values()
+        self._followed = [parameter for network, _ in pairs for parameter in network.parameters()]
+        self._following = [parameter for _, target in pairs for parameter in target.parameters()]
+        self._has_statistics = any(get_parameters_by_name(network, ["running_"]) for network, _ in pairs)
+
+    @property
+    def _log_std_bounds(self) -> tuple[float, float]:
+        return self.constructor_options["log_std_bounds"]
+
+    def _set_target(self, role: str, target: BaseModel) -> None:
+        target.load_state_dict(getattr(self, role).state_dict())
+        target.set_training_mode(False)
+        setattr(self, f"{role}_target", target)
 
     def _role_kwargs(self, role: str, shared: BaseFeaturesExtractor | None = None) -> dict[str, Any]:
         """
@@ -124,9 +190,9 @@ class AsymmetricPolicy(BoundedPolicy):
         """
         features_extractor, rest_extractor = shared, None
         if shared is None:
-            features_extractor = self._make_extractor(self.role_keys[role])
+            features_extractor = self._make_extractor(role, self.role_keys[role])
         else:
-            rest_extractor = self._make_extractor(self._keys_beside_the_deployed(role))
+            rest_extractor = self._make_extractor(role, self._keys_beside_the_deployed(role))
         extractors = [extractor for extractor in (features_extractor, rest_extractor) if extractor is not None]
         return {
             "observation_space": role_space(self.observation_space, self.role_keys[role]),  # type: ignore[arg-type]
@@ -139,24 +205,23 @@ class AsymmetricPolicy(BoundedPolicy):
         }
 
     def _body_kwargs(self, role: str, features_dim: int) -> dict[str, Any]:
-        """What comes after a role's encoder: hidden layers, after a memory where policies are recurrent."""
-        net_arch, options = self._role_net_arch[role], self.constructor_options
-        if self.cell is None:
+        """What comes after a role's encoder: hidden layers, after a memory where the role has one."""
+        net_arch, options, rnn_type = self._role_net_arch[role], self.constructor_options, self.rnn_types[role]
+        if rnn_type is None:
             return {"features_dim": features_dim, "net_arch": net_arch}
         hidden_size = options["rnn_hidden_size"]
         members = self.n_critics if role in self.roles.critics else 1
-        memory = Memory(self.cell, features_dim, net_arch, hidden_size, options["activation_fn"], members)
+        memory = Memory(rnn_type, features_dim, net_arch, hidden_size, options["activation_fn"], members)
         return {"memory": memory, "features_dim": hidden_size, "net_arch": options["rnn_net_arch"]}
 
-    def _make_extractor(self, keys: Sequence[str]) -> BaseFeaturesExtractor:
+    def _make_extractor(self, role: str, keys: Sequence[str]) -> BaseFeaturesExtractor:
         space = role_space(self.observation_space, keys)  # type: ignore[arg-type]
-        if self.features_extractor_class is CombinedExtractor:
-            return (
-                VectorExtractor(space)
-                if VectorExtractor.fits(space)
-                else EntryExtractor(space, **self.features_extractor_kwargs)
-            )
-        return self.features_extractor_class(space, **self.features_extractor_kwargs)
+        extractor = self._role_extractors[role]
+        if extractor is not CombinedExtractor:
+            return extractor(space, **self.features_extractor_kwargs)
+        return (
+            VectorExtractor(space) if VectorExtractor.fits(space) else EntryExtractor(space, **self.features_extractor_kwargs)
+        )
 
     def _keys_beside_the_deployed(self, role: str) -> list[str]:
         shared = self.role_keys[self.roles.deployed]
@@ -168,79 +233,50 @@ class AsymmetricPolicy(BoundedPolicy):
             )
         return keys
 
-    def _make_critic_and_target(
-        self, role: str, shared: BaseFeaturesExtractor | None
-    ) -> tuple[CriticEnsemble, CriticEnsemble]:
-        ensemble = DiscreteCriticEnsemble if isinstance(self.action_space, spaces.Discrete) else CriticEnsemble
-        critic = ensemble(**self._role_kwargs(role, shared), n_critics=self.n_critics)
-        target = ensemble(**self._role_kwargs(role, deepcopy(shared)), n_critics=self.n_critics)
-        target.load_state_dict(critic.state_dict())
-        target.set_training_mode(False)
-        return critic, target
+    # --- optimisers -------------------------------------------------------------------------------------------------
 
-    def _finish(self, lr_schedule: Schedule, unclipped: int = 0) -> None:
+    def unclipped(self, role: str) -> int:
         """
-        Once all networks are there: lay out their parameters, and give each network its optimiser, as the attribute that
-        SB3's SAC has on actor and critic.
+        :param role: a network
+        :return: how many of its last parameters have no say in the clipping of its gradient
+        """
+        return 0
 
-        :param lr_schedule: learning rate schedule
-        :param unclipped: how many of the deployed policy's last parameters have no say in the clipping of its gradient
-        """
-        deployed = list(self.deployed.parameters())  # with a shared encoder, whoever else holds it
-        self.flat_parameters = {self.roles.deployed: TrainedParameters(deployed, unclipped)}
-        of_deployed = {id(parameter) for parameter in deployed}
-        for role in self.roles.others:
-            if getattr(self, role) is not None:
-                own = [parameter for parameter in getattr(self, role).parameters() if id(parameter) not in of_deployed]
-                self.flat_parameters[role] = TrainedParameters(own)
+    def _build_optimizers(self, lr_schedule: Schedule) -> None:
+        """Each network's own, as the attribute that SB3's SAC has on actor and critic."""
         optimizer_class, kwargs = self.optimizer_class, dict(self.optimizer_kwargs)
-        if "foreach" not in kwargs and kwargs.get("fused", True):
-            optimizer_class = FlatAdam if optimizer_class is th.optim.Adam else optimizer_class
-            kwargs |= {"fused": True} if issubclass(optimizer_class, (th.optim.Adam, th.optim.AdamW)) else {}
+        if optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
+            kwargs.setdefault("fused", True)
         lr_scales = resolve_lr_scales(self.roles, self.constructor_options["lr_scales"])
-        for role, parameters in self.flat_parameters.items():
-            group = {"params": [parameters.flat], "lr_scale": lr_scales[role], "trained": parameters.trained}
-            getattr(self, role).optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore
-        self._collect_targets()
-
-    def _collect_targets(self) -> None:
-        """What Polyak averaging goes through: flat parameters, unless some are frozen or another network's."""
-        self._flat_targets: list[FlatParameters] = []
-        self._critic_parameters: list[th.Tensor] = []
-        self._target_parameters: list[th.Tensor] = []
-        for role, (critic, target) in self.critic_pairs.items():
-            of_critic, of_target = list(critic.parameters()), list(target.parameters())
-            if len(of_critic) == len(self.flat_parameters[role].parameters):
-                self._flat_targets.append(FlatParameters(of_target))
-                of_critic, of_target = [self.flat_parameters[role].flat], [self._flat_targets[-1].flat]
-            self._critic_parameters += of_critic
-            self._target_parameters += of_target
-        self._has_statistics = any(get_parameters_by_name(critic, ["running_"]) for critic, _ in self.critic_pairs.values())
+        of_deployed = {id(parameter) for parameter in self.deployed.parameters()}  # with a shared encoder, whoever else holds it
+        self.trained: dict[str, TrainedParameters] = {}
+        for role in (role for role in self.roles.all if getattr(self, role) is not None):
+            network = getattr(self, role)
+            own = [p for p in network.parameters() if role == self.roles.deployed or id(p) not in of_deployed]
+            group = {"params": own, "lr_scale": lr_scales[role]}
+            network.optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+            self.trained[role] = TrainedParameters(own, network.optimizer, self.unclipped(role))
 
     def refresh_parameters(self) -> None:
-        """
-        To be called before training and before saving: parameters that have been frozen, unfrozen, moved or replaced.
-
-        See :meth:`TrainedParameters.follow` and :meth:`FlatParameters.refresh`.
-        """
-        before = self.frozen
-        for role, parameters in self.flat_parameters.items():
-            parameters.follow(getattr(self, role).optimizer)
-        if self.frozen != before:
-            self._collect_targets()
-        for flat in (*self.flat_parameters.values(), *self._flat_targets):
-            flat.refresh()
+        """To be called before training and before saving: parameters may have been frozen, see :class:`TrainedParameters`."""
+        for parameters in self.trained.values():
+            parameters.refresh()
 
     @property
-    def frozen(self) -> tuple[tuple[str, int], ...]:
-        """Role and number of each parameter that is not trained, after :meth:`refresh_parameters`."""
-        flat_parameters = self.flat_parameters.items()
-        return tuple((role, i) for role, flat in flat_parameters for i, trained in enumerate(flat.trained) if not trained)
+    def optimizer_options(self) -> tuple[Any, ...]:
+        """What a step of the optimisers depends on, but for learning rates: frozen parameters and options."""
+        groups = [getattr(self, role).optimizer.param_groups[0] for role in self.trained]
+        return tuple(
+            value if not isinstance(value, list) else tuple(value)
+            for group in groups
+            for name, value in group.items()
+            if name not in ("params", "lr", "initial_lr", "lr_scale")
+        )
 
     def freeze_as_saved(self) -> None:
-        """To be called when a file has given the optimisers their state: see :meth:`TrainedParameters.freeze_as_in`."""
-        for role, parameters in self.flat_parameters.items():
-            parameters.freeze_as_in(getattr(self, role).optimizer)
+        """To be called when a file has given the optimisers their state."""
+        for parameters in self.trained.values():
+            parameters.freeze_as_saved()
 
     def scale_learning_rates(self, lr_scales: Mapping[str, float] | None) -> None:
         """
@@ -248,12 +284,8 @@ class AsymmetricPolicy(BoundedPolicy):
         """
         self.constructor_options["lr_scales"] = lr_scales
         for role, scale in resolve_lr_scales(self.roles, lr_scales).items():
-            if role in self.flat_parameters:
+            if role in self.trained:
                 getattr(self, role).optimizer.param_groups[0]["lr_scale"] = scale
-
-    def flat_tensors(self) -> list[th.Tensor]:
-        """Those that parameters are views of, after :meth:`refresh_parameters`."""
-        return [parameters.flat for parameters in (*self.flat_parameters.values(), *self._flat_targets)]
 
     @property
     def deployed(self) -> DeployedPolicy:
@@ -261,10 +293,10 @@ class AsymmetricPolicy(BoundedPolicy):
         return getattr(self, self.roles.deployed)
 
     @property
-    def critic_pairs(self) -> dict[str, tuple[CriticEnsemble, CriticEnsemble]]:
-        """Role -> (critic, target), for each critic that there is."""
-        critics = [role for role in self.roles.critics if getattr(self, role) is not None]
-        return {role: (getattr(self, role), getattr(self, f"{role}_target")) for role in critics}
+    def pairs(self) -> dict[str, tuple[BaseModel, BaseModel]]:
+        """Role -> (network, target), for each network that has one."""
+        roles = (role for role in self.roles.all if getattr(self, f"{role}_target", None) is not None)
+        return {role: (getattr(self, role), getattr(self, f"{role}_target")) for role in roles}
 
     def update_targets(self, tau: float) -> None:
         """
@@ -272,18 +304,16 @@ class AsymmetricPolicy(BoundedPolicy):
 
         :param tau: in [0, 1]
         """
-        polyak_average(self._critic_parameters, self._target_parameters, tau)
-        if not self._has_statistics:
-            return
-        for critic, target in self.critic_pairs.values():  # not collected once: a move to another device replaces buffers
-            polyak_average(get_parameters_by_name(critic, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
+        polyak_average(self._followed, self._following, tau)
+        for network, target in self.pairs.values() if self._has_statistics else ():  # a move to another device replaces them
+            polyak_average(get_parameters_by_name(network, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
 
     # --- acting -----------------------------------------------------------------------------------------------------
 
     @property
-    def halves_are_independent(self) -> bool:
-        """Whether the two halves of a gradient step share nothing that either changes."""
-        return not self.share_features_extractor
+    def branches_are_independent(self) -> bool:
+        """Whether the algorithm's update has branches that share nothing that either changes."""
+        return False
 
     def check_seen_by(self, role: str, observation: Any, where: str) -> None:
         """
@@ -302,23 +332,44 @@ class AsymmetricPolicy(BoundedPolicy):
                 f"predict() is for observations of {list(self.role_keys[self.roles.deployed])} alone."
             )
 
-    @abstractmethod
+    def action_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:
+        """
+        :param outputs: role -> what its network computed, for each policy
+        :return: role -> distribution of its actions
+        """
+        return outputs
+
+    @th.no_grad()
     def behaviour_action(
         self,
         observation: dict[str, np.ndarray],
         state: BehaviourState = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
+        acting: Sequence[str] | None = None,
     ) -> tuple[np.ndarray, BehaviourState]:
         r"""
-        Action of the policy that collects the data, in [-1, 1] or one of a number.
+        Action of the policies that collect the data, in [-1, 1] or one of a number.
 
         :param observation: full observation, B of each entry
         :param state: what the last call returned, ``None`` at the start
         :param episode_start: true where an episode starts, shape (B,)
         :param deterministic: mode instead of a sample
-        :return: shape (B, \*action shape), and what recurrent policies remember
+        :param acting: role that acts in each environment; by default ``roles.behaviour``
+        :return: shape (B, \*action shape), and what recurrent policies remember, those that do not act as well
         """
+        obs, _ = self._acting_reader.read(observation, self.device)
+        names = self.roles.policies
+        before = state or (None,) * len(names)
+        steps = [getattr(self, name).remember(obs, own, episode_start) for name, own in zip(names, before, strict=True)]
+        policies = self.action_distributions(dict(zip(names, (output for output, _ in steps), strict=True)))
+        after = tuple(remembered for _, remembered in steps)
+        roles = list(dict.fromkeys(acting if acting is not None else [self.roles.behaviour]))
+        actions = self._chosen(policies[roles[0]], deterministic)
+        for role in roles[1:]:
+            rows = np.array([name == role for name in acting or ()])
+            actions[rows] = self._chosen(policies[role], deterministic)[rows]
+        return actions, None if all(remembered is None for remembered in after) else after
 
     def _chosen(self, actions: Distribution, deterministic: bool) -> np.ndarray:
         r"""
@@ -370,7 +421,7 @@ class AsymmetricPolicy(BoundedPolicy):
 
         :param mode: True for training
         """
-        for role in self.flat_parameters:
+        for role in self.trained:
             getattr(self, role).set_training_mode(mode)
         self.training = mode
 

@@ -4,10 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 
 from sb3_gac.checks.entries import check_entries
-from sb3_gac.checks.values import check_integer, check_positive
+from sb3_gac.checks.values import check_choice, check_integer, check_positive
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
+from sb3_gac.networks.recurrent import CELLS
 
 CRITICS = "critic"
 DEFAULT_NET_ARCH = (256, 256)
@@ -18,14 +20,30 @@ RoleKeys = Mapping[str, Sequence[str]]
 
 class Roles(NamedTuple):
     """
-    The networks of an algorithm.
+    The networks of an algorithm that are trained, by kind.
 
     :param deployed: the policy that acts without privileged entries
-    :param others: the rest; names of critics end in "critic"
+    :param actors: other policies
+    :param critics: ensembles that value actions, each with a target
+    :param target_policies: those policies that have a target as well
+    :param collects: the policy that acts in training, by default the deployed one
     """
 
     deployed: str
-    others: tuple[str, ...]
+    actors: tuple[str, ...] = ()
+    critics: tuple[str, ...] = ()
+    target_policies: tuple[str, ...] = ()
+    collects: str | None = None
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Those that act, the deployed one first."""
+        return (self.deployed, *self.actors)
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """Every role but the deployed one."""
+        return (*self.actors, *self.critics)
 
     @property
     def all(self) -> tuple[str, ...]:
@@ -33,14 +51,9 @@ class Roles(NamedTuple):
         return (self.deployed, *self.others)
 
     @property
-    def critics(self) -> list[str]:
-        """Those that value actions."""
-        return [role for role in self.others if role.endswith(CRITICS)]
-
-    @property
-    def policies(self) -> list[str]:
-        """Those that act."""
-        return [role for role in self.all if role not in self.critics]
+    def behaviour(self) -> str:
+        """The policy that collects the data."""
+        return self.collects or self.deployed
 
     @property
     def names(self) -> list[str]:
@@ -79,10 +92,7 @@ def resolve_role_keys(
         for the deployed policy
     """
     entries = tuple(check_observation_space(observation_space).spaces)
-    role_keys = role_keys or {}
-    unknown_roles = sorted(set(role_keys) - {*roles.all, CRITICS})
-    if unknown_roles:
-        raise ValueError(f"role_keys names unknown roles {unknown_roles}; the roles are {roles.names}.")
+    role_keys = _check_roles("role_keys", roles, role_keys or {})
     if roles.deployed not in role_keys and PARTIAL not in entries:
         raise ValueError(
             f'The observation has no entry "{PARTIAL}" (its entries are {list(entries)}). Rename the entry that the '
@@ -140,13 +150,50 @@ def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> di
     :return: role -> multiple, for all roles
     :raises ValueError: if a role is unknown or a multiple is not a number above 0
     """
-    lr_scales = dict(lr_scales or {})
-    unknown_roles = sorted(set(lr_scales) - {*roles.all, CRITICS})
-    if unknown_roles:
-        raise ValueError(f"lr_scales names unknown roles {unknown_roles}; the roles are {roles.names}.")
+    lr_scales = _check_roles("lr_scales", roles, lr_scales or {})
     for role, scale in lr_scales.items():
         check_positive(f'lr_scales["{role}"]', scale)
     return dict.fromkeys(roles.all, 1.0) | _for_each_role(roles, lr_scales)
+
+
+def resolve_rnn_types(roles: Roles, rnn_type: str | Mapping[str, str | None] | None) -> dict[str, str | None]:
+    """
+    Which networks remember.
+
+    :param roles: of the algorithm
+    :param rnn_type: "gru", "lstm" or ``None`` for all roles, or role, or "critic" for all critics -> one of them
+    :return: role -> type, ``None`` for a network without a memory, for all roles
+    :raises ValueError: if a role or a type is unknown
+    """
+    given = _check_roles("rnn_type", roles, rnn_type if isinstance(rnn_type, Mapping) else dict.fromkeys(roles.all, rnn_type))
+    for value in given.values():
+        if value is not None:
+            check_choice("rnn_type", value, CELLS)
+    return dict.fromkeys(roles.all) | _for_each_role(roles, given)
+
+
+def resolve_extractors(
+    roles: Roles, extractor: type[BaseFeaturesExtractor] | Mapping[str, type[BaseFeaturesExtractor]]
+) -> dict[str, type[BaseFeaturesExtractor]]:
+    """
+    Encoders per role.
+
+    :param roles: of the algorithm
+    :param extractor: one class for all roles, or role, or "critic" for all critics -> class, where it is not SB3's default
+    :return: role -> class, for all roles
+    :raises ValueError: if a role is unknown
+    """
+    if not isinstance(extractor, Mapping):
+        return dict.fromkeys(roles.all, extractor)
+    given = _check_roles("features_extractor_class", roles, extractor)
+    return dict.fromkeys(roles.all, CombinedExtractor) | _for_each_role(roles, given)
+
+
+def _check_roles(name: str, roles: Roles, given: Mapping[str, T]) -> Mapping[str, T]:
+    unknown_roles = sorted(set(given) - {*roles.all, CRITICS})
+    if unknown_roles:
+        raise ValueError(f"{name} names unknown roles {unknown_roles}; the roles are {roles.names}.")
+    return given
 
 
 def _for_each_role(roles: Roles, values: Mapping[str, T]) -> dict[str, T]:

@@ -1,11 +1,12 @@
-"""The train loop, and what a gradient step is put together from."""
+"""The train loop, and the one primitive that a gradient step is put together from: ``minimize``."""
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -13,13 +14,14 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_gac.base.faults import FaultTolerance
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.divergence import check_finite_metrics
-from sb3_gac.math.distributions import Distribution
-from sb3_gac.math.losses import critic_loss, masked_mean
+from sb3_gac.math.losses import critic_loss, masked_mean, soft_target
 from sb3_gac.networks.actors import RolePolicy
-from sb3_gac.optim.compile import Program, Staged, StagedProgram, compilable_in_stages
-from sb3_gac.optim.parallel import halved_threads, run_halves
+from sb3_gac.optim.coefficients import Coefficient
+from sb3_gac.optim.compile import Program
+from sb3_gac.optim.parallel import halved_threads, run_side_by_side
 from sb3_gac.replay.episodes import EpisodeReplayBuffer, SequenceSamples
 
+#: Name -> detached scalar, left on the device
 Metrics = dict[str, th.Tensor]
 
 
@@ -46,20 +48,52 @@ class Batch(NamedTuple):
     sequence: PyTorchObs | None = None
     mask: th.Tensor | None = None
 
-    def outputs(self, policy: RolePolicy) -> tuple[Any, Any]:
+    def outputs(self, policy: RolePolicy) -> "Outputs":
         """
         :param policy: a policy's network
-        :return: its distribution for the observations, and, as a constant, for the next ones; for sequences in one pass
+        :return: its distributions for the observations and, as constants, for the next ones; with a memory in one pass
         """
-        if self.sequence is None:
+        if policy.memory is None:
             now = policy.distribution(self.observations)
             with th.no_grad():
-                return now, policy.distribution(self.next_observations)
-        both: Any = policy.distribution(self.sequence)
-        return type(both)(*(part[:-1] for part in both)), type(both)(*(part[1:].detach() for part in both))
+                return Outputs(now, policy.distribution(self.next_observations))
+        both: Any = policy.distribution(self.sequence)  # type: ignore[arg-type]
+        return Outputs(type(both)(*(part[:-1] for part in both)), type(both)(*(part[1:].detach() for part in both)))
+
+    def soft_target(
+        self,
+        next_q: th.Tensor,
+        *,
+        log_prob: th.Tensor | float = 0.0,
+        ent_coef: th.Tensor | float = 0.0,
+        kl: th.Tensor | float = 0.0,
+        kl_coef: th.Tensor | float = 0.0,
+        reward: th.Tensor | None = None,
+    ) -> th.Tensor:
+        r"""
+        The Bellman target of these transitions, see :func:`sb3_gac.math.losses.soft_target`.
+
+        :param next_q: target critics at the next observations, shape (N, \*E)
+        :param log_prob: of the next actions, shape (\*E)
+        :param ent_coef: its weight
+        :param kl: at the next observations, shape (\*E)
+        :param kl_coef: its weight
+        :param reward: in place of the batch's, shape (\*E)
+        :return: shape (\*E)
+        """
+        return soft_target(
+            reward=self.rewards if reward is None else reward,
+            done=self.dones,
+            next_q=next_q,
+            discount=self.discounts,
+            next_log_prob=log_prob,
+            ent_coef=ent_coef,
+            next_kl=kl,
+            kl_coef=kl_coef,
+        )
 
     @th.no_grad()
-    def values_at(self, critic: Any) -> Callable[[Any], th.Tensor]:
+    def q_at_obs(self, critic: Any) -> Callable[[Any], th.Tensor]:
         """
         :param critic: an ensemble, frozen
         :return: actions at the observations -> values, differentiable by the actions
@@ -67,83 +101,182 @@ class Batch(NamedTuple):
         return partial(critic.values, critic.encode(self.observations))
 
     @th.no_grad()
-    def values_after(self, critic: Any) -> Callable[[Any], th.Tensor]:
+    def q_at_next_obs(self, critic: Any) -> Callable[[Any], th.Tensor]:
         """
         :param critic: an ensemble, frozen
         :return: actions at the next observations -> values
         """
-        if self.sequence is None:
+        if critic.memory is None:
             return partial(critic.values, critic.encode(self.next_observations))
         return partial(critic.values, critic.encode(self.sequence)[:, 1:])
 
 
-class Descent(NamedTuple):
+class Outputs(NamedTuple):
     """
-    What a loss asks of a network.
+    What a policy's network computes for a batch.
 
-    :param gradient: with respect to its flat parameters
-    :param metrics: loss, gradient norm and whatever else is to be logged, detached
+    :param now: for the observations, with its gradient
+    :param later: for the next observations, constant
     """
 
-    gradient: th.Tensor
+    now: Any
+    later: Any
+
+
+class Loss(NamedTuple):
+    """
+    :param value: what a network minimises, scalar
+    :param metrics: what else is to be logged, or is needed for the coefficients, scalars
+    """
+
+    value: th.Tensor
     metrics: Metrics
 
 
-class Slope(NamedTuple):
+class Step(NamedTuple):
     """
-    What a loss asks of a policy's outputs.
+    A step down a loss, for :meth:`NetworkTraining.side_by_side`.
 
-    :param gradient: with respect to them, in their structure
-    :param metrics: loss and whatever else is to be logged, detached
+    :param network: see :meth:`NetworkTraining.minimize`
+    :param loss: see there
+    :param tensors: see there
     """
 
-    gradient: Distribution
-    metrics: Metrics
-
-
-#: A policy's backward pass: gradient with respect to its outputs -> with respect to its flat parameters, and that one's norm
-Backward: TypeAlias = Callable[[Distribution], tuple[th.Tensor, th.Tensor]]
-
-
-def as_leaves(outputs: Any) -> Any:
-    """
-    :param outputs: of a policy, constants
-    :return: the same, to be differentiated by
-    """
-    return type(outputs)(*(part.detach().requires_grad_() for part in outputs))
-
-
-def gradient_of(loss: th.Tensor, outputs: Any) -> Any:
-    """
-    :param loss: scalar
-    :param outputs: of a policy, see :func:`as_leaves`
-    :return: the loss's gradient with respect to each
-    """
-    return type(outputs)(*th.autograd.grad(loss, outputs, allow_unused=True, materialize_grads=True))
+    network: str
+    loss: Callable[..., Loss]
+    tensors: tuple[Any, ...]
 
 
 class NetworkTraining(FaultTolerance):
     """
-    ``train`` for networks that are laid out flat, each with its optimiser: a subclass writes one gradient step.
+    ``train`` for the networks of a policy and their coefficients: a subclass writes one ``update``, made of ``minimize``.
 
-    The attributes below are those of :class:`sb3_gac.base.off_policy.AsymmetricOffPolicyAlgorithm`.
+    What changes from step to step must be a tensor: an argument of a loss, a parameter or a coefficient's value. Numbers that
+    a loss finds on ``self`` are named in ``compiled_settings``. The attributes below are those of
+    :class:`sb3_gac.base.off_policy.AsymmetricOffPolicyAlgorithm`.
     """
 
-    #: Arguments that a compiled part takes for constants: a change compiles it anew
+    #: Arguments that a compiled update takes for constants: a change compiles it anew
     compiled_settings: ClassVar[tuple[str, ...]] = ("max_grad_norm", "mixed_precision")
     policy: AsymmetricPolicy
+    coefficients: dict[str, Coefficient]
     tau: float
     target_update_interval: int
     max_grad_norm: float | None
     compile: bool
     mixed_precision: bool
-    programs: dict[Any, Program | StagedProgram]
-    program_key: tuple[Any, ...]
-    _halves_are_independent: bool
-    _halves_together = False
+    _update_every: Mapping[str, int]
+    programs: dict[Any, Program]
+    _branches_are_independent: bool
+    _at_once = False
+    _program_key: tuple[Any, ...] = ()
+    #: Networks that the gradient step under way leaves as they are, see ``update_every``
+    _resting: frozenset[str] = frozenset()
     #: Of the last round of gradient steps, all finite
     _last_metrics: Mapping[str, float] = MappingProxyType({})
     _waiting = False
+
+    # --- what an algorithm writes, and what it writes it with ---------------------------------------------------------
+
+    @abstractmethod
+    def update(self, batch: Batch) -> Metrics:
+        """
+        One gradient step of all networks and coefficients; targets follow by themselves.
+
+        :param batch: B transitions
+        :return: to log under "train/"
+        """
+
+    def minimize(self, networks: str | tuple[str, ...], loss: Callable[..., Loss], *tensors: Any) -> Metrics:
+        """
+        One step of a network's optimiser down a loss, for which all other networks are constants.
+
+        :param networks: name of one, or of several that share a loss, each with its own optimiser and bound on its gradient
+        :param loss: function of the tensors
+        :param tensors: in tuples or dicts; what changes from step to step
+        :return: the loss under the (first) network's name, the norms of the gradients, and the loss's metrics
+        """
+        names = (networks,) if isinstance(networks, str) else networks
+        with self._precision():
+            value, metrics = loss(*tensors)
+        metrics = {name: metric.detach() for name, metric in {f"{names[0]}_loss": value, **metrics}.items()}
+        trained = {name: self.policy.trained[name] for name in names if name not in self._resting}
+        parameters = [parameter for network in trained.values() for parameter in network.parameters]
+        gradients: Sequence[th.Tensor] = ()
+        if parameters and value.requires_grad:
+            gradients = th.autograd.grad(value, parameters, allow_unused=True, materialize_grads=True)
+        for name, network in trained.items():
+            own, gradients = gradients[: len(network.parameters)], gradients[len(network.parameters) :]
+            metrics[f"{name}_grad_norm"] = network.step(own, self.max_grad_norm)
+        return metrics
+
+    def side_by_side(self, *branches: Sequence[Step]) -> Metrics:
+        """
+        The same as ``minimize`` for each step of each branch; branches may run at once.
+
+        :param branches: no step of one changes what a step of another reads, but for what was computed before; steps of
+            networks that an ablation does without are left out
+        :return: metrics of all steps
+        """
+        branches = tuple([step for step in branch if self.policy.has(step.network)] for branch in branches)
+        if not self._at_once:
+            steps = [step for branch in branches for step in branch]
+            return _joined([self.minimize(step.network, step.loss, *step.tensors) for step in steps])
+        return _joined(run_side_by_side([partial(self._run_branch, branch) for branch in branches]))
+
+    def _run_branch(self, branch: Sequence[Step]) -> Metrics:
+        def run(*tensors: Any) -> Metrics:
+            return _joined([self.minimize(s.network, s.loss, *own) for s, own in zip(branch, tensors, strict=True)])
+
+        name = tuple(step.network for step in branch)
+        tensors = [step.tensors for step in branch]
+        return self._compiled(name, run, *tensors) if self.compile else run(*tensors)
+
+    def outputs(self, batch: Batch, *roles: str) -> list[Outputs]:
+        """
+        Forward passes of policies, before any network is changed.
+
+        :param batch: of transitions
+        :param roles: names of the policies
+        """
+
+        def run(batch: Batch) -> list[Outputs]:
+            with self._precision():
+                return [batch.outputs(getattr(self.policy, role)) for role in roles]
+
+        if not self._in_several_programs:
+            return run(batch)
+        with th.no_grad():
+            return self._compiled(roles, run, batch)
+
+    def now(self, role: str, outputs: Outputs, batch: Batch) -> Any:
+        """
+        What a loss differentiates by.
+
+        :param role: a policy
+        :param outputs: what :meth:`outputs` returned of it
+        :param batch: that was computed for
+        :return: its distributions for the observations, with their gradient, which does not pass from program to program
+        """
+        if not self._in_several_programs:
+            return outputs.now
+        return getattr(self.policy, role).distribution(batch.observations)
+
+    def critic_loss(self, name: str, batch: Batch, target: th.Tensor) -> Loss:
+        r"""
+        :param name: of the critics
+        :param batch: of transitions
+        :param target: Bellman target, shape (\*E)
+        :return: squared Bellman residual, with the mean Q
+        """
+        q = getattr(self.policy, name)(batch.observations, batch.actions)
+        return Loss(critic_loss(q, target, batch.mask), {f"{name}_q": masked_mean(q.detach().mean(dim=0), batch.mask)})
+
+    def coefficient_values(self) -> Metrics:
+        """To be logged: name -> value, the mean over dimensions where there are several."""
+        return {name: coefficient.value.mean() for name, coefficient in self.coefficients.items()}
+
+    # --- the loop -----------------------------------------------------------------------------------------------------
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """
@@ -153,13 +286,14 @@ class NetworkTraining(FaultTolerance):
         if self._waits_for_an_episode():
             return
         self.policy.set_training_mode(True)
-        self.policy.refresh_parameters()
         self._update_learning_rate(self._scheduled_optimizers())
+        self.policy.refresh_parameters()
+        self._refresh_schedules()
+        self._at_once = self._branches_are_independent and th.get_num_threads() > 1
         settings = (getattr(self, name) for name in self.compiled_settings)
-        self.program_key = (batch_size, self.policy, self.policy.frozen, *settings)
-        self._halves_together = self._halves_are_independent and th.get_num_threads() > 1
-        with halved_threads(self._halves_together):
-            history = [self._one_update(batch_size, diagnose=left == 1) for left in range(gradient_steps, 0, -1)]
+        self._program_key = (self.policy, self.policy.optimizer_options, *settings)
+        with halved_threads(self._at_once):
+            history = [self._one_update(batch_size) for _ in range(gradient_steps)]
         self._record_metrics(history)
 
     def _waits_for_an_episode(self) -> bool:
@@ -175,82 +309,37 @@ class NetworkTraining(FaultTolerance):
         self._waiting = waits
         return waits
 
-    def _one_update(self, batch_size: int, diagnose: bool) -> Metrics:
-        metrics = self._gradient_step(self._sample_batch(batch_size), diagnose)
+    def _one_update(self, batch_size: int) -> Metrics:
+        batch = self._sample_batch(batch_size)
+        self._resting = frozenset(name for name, every in self._update_every.items() if self._n_updates % every)
+        whole = self.compile and not self._at_once
+        metrics = self._compiled("update", self.update, batch) if whole else self.update(batch)
         self._n_updates += 1
         if self._n_updates % self.target_update_interval == 0:
             self.policy.update_targets(self.tau)
         return metrics
 
-    def _run_halves(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
-        """
-        :param tasks: independent of each other, see :func:`run_halves`
-        :return: their results
-        """
-        return run_halves(tasks, self._halves_together)
+    @property
+    def _in_several_programs(self) -> bool:
+        """Whether each branch is compiled by itself."""
+        return self.compile and self._at_once
 
-    def _critic_descent(self, name: str, batch: Batch, target: th.Tensor) -> Descent:
+    def _compiled(self, name: Any, function: Callable[..., Any], *args: Any) -> Any:
         """
-        An ensemble's way towards its Bellman targets.
+        :param name: of the function
+        :param function: of tensors, and of what the key says of this object
+        :param args: its arguments
+        :return: its value, by a program of its own for all that the key says
+        """
+        key = (name, self._resting, *self._program_key, *_layout(args))
+        if key not in self.programs:
+            self.programs[key] = Program(function, self.device)
+        return self.programs[key](*args)
 
-        :param name: attribute of the policy
-        :param batch: B transitions
-        :param target: shape (B,)
-        :return: with loss, mean Q and gradient norm, named after the ensemble
-        """
-        q = getattr(self.policy, name)(batch.observations, batch.actions)
-        loss = critic_loss(q, target, batch.mask)
-        gradient, norm = self.policy.flat_parameters[name].gradient(loss, self.max_grad_norm)
-        mean_q = masked_mean(q.detach().mean(dim=0), batch.mask)
-        return Descent(gradient, {f"{name}_q": mean_q, f"{name}_loss": loss.detach(), f"{name}_grad_norm": norm})
-
-    @compilable_in_stages
-    def _policy_pass(self, name: str, batch: Batch) -> Staged:
-        """
-        A policy's forward pass, to which its backward pass belongs: call it for the outputs and a :data:`Backward`.
-
-        :param name: attribute of the policy
-        :param batch: B transitions
-        """
-        now, later = batch.outputs(getattr(self.policy, name))
-        slopes = yield now.detach(), later
-        yield self.policy.flat_parameters[name].gradient(now, self.max_grad_norm, slopes)
-
-    def _policy_step(self, name: str, backward: Backward, slope: Slope) -> Metrics:
-        """
-        One step of a policy's optimiser.
-
-        :param name: attribute of the policy
-        :param backward: pass of that policy
-        :param slope: of its loss
-        :return: metrics, with the gradient norm
-        """
-        gradient, norm = backward(slope.gradient)
-        return self._step(name, Descent(gradient, {**slope.metrics, f"{name}_grad_norm": norm}))
-
-    def _step(self, name: str, descent: Descent) -> Metrics:
-        """
-        One step of a network's optimiser.
-
-        :param name: attribute of the policy
-        :param descent: of that network
-        :return: its metrics
-        """
-        flat_parameters = self.policy.flat_parameters[name]
-        if flat_parameters.parameters:  # unless all are frozen
-            flat_parameters.flat.grad = descent.gradient
-            getattr(self.policy, name).optimizer.step()
-        return descent.metrics
-
-    @abstractmethod
-    def _gradient_step(self, batch: Batch, diagnose: bool = True) -> Metrics:
-        """
-        One update of all networks but the targets.
-
-        :param batch: B transitions
-        :param diagnose: whether to add what costs extra, as on the last of a round
-        :return: detached tensors of shape () to log under "train/", left on the device
-        """
+    def _precision(self) -> AbstractContextManager:
+        if self.mixed_precision:
+            return th.autocast(self.device.type, th.bfloat16, cache_enabled=False)
+        return nullcontext()
 
     def _sample_batch(self, batch_size: int) -> Batch:
         assert self.replay_buffer is not None
@@ -272,9 +361,10 @@ class NetworkTraining(FaultTolerance):
             discounts.flatten() if discounts.dim() else discounts,
         )
 
-    @abstractmethod
-    def _dual_names(self) -> list[str]:
-        """Attributes that hold coefficients."""
+    def _refresh_schedules(self) -> None:
+        """Before a round of gradient steps: put in tensors what schedules say now."""
+        for coefficient in self.coefficients.values():
+            coefficient.refresh()
 
     @abstractmethod
     def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
@@ -289,7 +379,7 @@ class NetworkTraining(FaultTolerance):
 
     def _record_metrics(self, history: list[Metrics]) -> None:
         """
-        Log means over the gradient steps of one ``train()``, and diagnostics of the last: the only host transfer.
+        Log means over the gradient steps of one ``train()``: the only host transfer.
 
         :param history: of each gradient step
         :raises DivergenceError: if a metric is not finite
@@ -297,15 +387,30 @@ class NetworkTraining(FaultTolerance):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if not history:
             return
-        names, last = list(history[0]), history[-1]
-        means = th.stack([th.stack([step[name] for name in names]) for step in history]).mean(dim=0)
-        diagnostics = [name for name in last if name not in names]
-        means = th.cat([means, *(last[name].reshape(1) for name in diagnostics)])
-        values = dict(zip([*names, *diagnostics], means.tolist(), strict=True))
+        names = list(dict.fromkeys(name for step in history for name in step))  # a resting network leaves some out
+        means = [th.stack([step[name] for step in history if name in step]).mean() for name in names]
+        values = dict(zip(names, th.stack(means).tolist(), strict=True))
         values["actor_loss"] = values[f"{self.policy.roles.deployed}_loss"]  # SB3's names for the two
         values["critic_loss"] = sum(value for name, value in values.items() if name.endswith("critic_loss"))
         for name, value in values.items():
             self.logger.record(f"train/{name}", value)
-        coefficients = {name.removesuffix("_dual"): getattr(self, name).value for name in self._dual_names()}
+        coefficients = {name: coefficient.value for name, coefficient in self.coefficients.items()}
         check_finite_metrics(self, values, self._last_metrics, coefficients)
         self._last_metrics = values
+
+
+def _joined(metrics: Sequence[Metrics]) -> Metrics:
+    return {name: value for part in metrics for name, value in part.items()}
+
+
+def _layout(value: Any) -> Iterator[Any]:
+    """Shapes and types of the tensors in tuples, lists and dicts."""
+    if isinstance(value, th.Tensor):
+        yield value.shape, value.dtype
+    elif isinstance(value, dict):
+        for key, part in value.items():
+            yield key
+            yield from _layout(part)
+    elif value is not None:
+        for part in value:
+            yield from _layout(part)

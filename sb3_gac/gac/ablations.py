@@ -4,9 +4,9 @@ from typing import Any
 
 import torch as th
 
+from sb3_gac.base.update import Batch
 from sb3_gac.gac.gac import GAC
 from sb3_gac.gac.policies import ActionDistributions
-from sb3_gac.gac.update import StepInputs
 from sb3_gac.math.losses import distillation_loss
 
 
@@ -17,7 +17,7 @@ class GACShare(GAC):
     ``learner_kl_scale="auto"`` is 1 whatever the guider: the pull is part of what is compared.
     """
 
-    def _auto_learner_pull(self) -> float:
+    def _auto_learner_kl_weight(self) -> float:
         return 1.0
 
     def _policy_options(self) -> dict[str, Any]:
@@ -30,5 +30,8 @@ class GACWithoutQ(GACShare):
     def _learner_can_train_a_std(self) -> bool:
         return False
 
-    def _learner_loss(self, inputs: StepInputs, now: ActionDistributions, noise: th.Tensor) -> th.Tensor:
-        return distillation_loss(now.guider.detach().kl_of_means(now.learner, self.kl_reduction), inputs.batch.mask)
+    def learner_objective(
+        self, batch: Batch, now: ActionDistributions, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
+    ) -> th.Tensor:
+        """Eq. 14."""
+        return distillation_loss(now.guider.detach().kl_of_means(now.learner, self.kl_reduction), batch.mask)

@@ -19,7 +19,7 @@ from sb3_gac.gac.actors import GUIDERS
 from sb3_gac.gac.policies import STD_OF, GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
 from sb3_gac.gac.update import GuidedUpdate
 from sb3_gac.math.distributions import KL_REDUCTIONS
-from sb3_gac.optim.coefficients import make_coefficient
+from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 
 KL_COEF_START = 1.0
 
@@ -177,12 +177,14 @@ class GAC(GuidedUpdate):
             "std_of": self.std_of if self.std_of != "auto" else ("learner" if own else "guider"),
         }
 
-    def _setup_coefficients(self) -> None:
-        super()._setup_coefficients()
+    def make_coefficients(self) -> dict[str, Coefficient]:
+        """The entropy temperature, and the weight of the KL."""
         self.target_kl_schedule = PlainSchedule(self.target_kl)
-        self.kl_coef_dual = make_coefficient(
+        self.target_kl_tensor = th.zeros((), device=self.device)
+        kl_coef = make_coefficient(
             "kl_coef", self.kl_coef, KL_COEF_START, self.kl_coef_bounds, self.kl_coef_learning_rate, self.device
         )
+        return super().make_coefficients() | {"kl_coef": kl_coef}
 
     # --- SB3's contract ---------------------------------------------------------------------------------------------
 
@@ -210,6 +212,3 @@ class GAC(GuidedUpdate):
         scaled_action, state = self.policy.behaviour_action(observation, state, episode_start, deterministic)
         action = self._in_environments_range(scaled_action)
         return (action if vectorized else action.squeeze(axis=0)), state
-
-    def _dual_names(self) -> list[str]:
-        return [*super()._dual_names(), "kl_coef_dual"]

@@ -1,19 +1,18 @@
 """Guider, learner and four critics: the networks of Guided Actor-Critic for Box and Discrete actions."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
+from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles
-from sb3_gac.gac.actors import GUIDERS, Learner, LearnerAsActor
+from sb3_gac.gac.actors import GUIDERS, Guider, Learner, LearnerAsActor
 from sb3_gac.math.distributions import Distribution
+from sb3_gac.networks.actors import RolePolicy
 from sb3_gac.networks.critics import CriticEnsemble
-from sb3_gac.networks.heads import LOG_STD_BOUNDS
 
 STD_OF = ("learner", "guider")
 
@@ -37,34 +36,26 @@ class GACPolicy(AsymmetricPolicy):
     """
     All networks of GAC and their optimisers. As a policy it is the learner: ``predict`` needs its entries alone.
 
-    :param observation_space: Dict
-    :param action_space: Box or Discrete
-    :param lr_schedule: learning rate schedule
+    Arguments that are not described here are those of :class:`AsymmetricPolicy`.
+
     :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}`` or ``{"guider", "learner", "critic"}``
-    :param activation_fn: between layers
     :param guider: "residual" or "independent", a key of ``GUIDERS``
-    :param role_keys: role -> observation entries, see :func:`sb3_gac.base.roles.resolve_role_keys`
     :param max_kl: hard bound on KL(guider || learner), or ``None``
     :param kl_reduction: how that KL is reduced over action dimensions, "mean" or "sum"
     :param learner_critics: whether the learner has critics of its own
     :param std_of: whose std both Gaussians have, one of ``STD_OF``; what the other's network says of its own counts at most
         at deployment
-    :param log_std_bounds: smallest and largest log standard deviation before tanh
-    :param features_extractor_class: encoder, made once per role on the entries of that role
-    :param features_extractor_kwargs: keyword arguments for it
-    :param share_features_extractor: whether guider and critics see the learner's features of its entries, as they are,
-        and encode only the other entries themselves; the learner's loss trains that encoder (saves most of the work
-        where ``partial`` is an image)
-    :param normalize_images: divide images by 255
-    :param optimizer_class: optimiser of policies and critics
-    :param optimizer_kwargs: keyword arguments for it, without the learning rate
-    :param n_critics: size of each of the two critic ensembles
     """
 
     learner_critic: CriticEnsemble | None
     learner_critic_target: CriticEnsemble | None
 
-    roles = Roles("learner", ("guider", "guider_critic", "learner_critic"))
+    guider: Guider
+    learner: Learner
+    guider_critic: CriticEnsemble
+    guider_critic_target: CriticEnsemble
+
+    roles = Roles("learner", actors=("guider",), critics=("guider_critic", "learner_critic"), collects="guider")
 
     def __init__(
         self,
@@ -78,28 +69,32 @@ class GACPolicy(AsymmetricPolicy):
         kl_reduction: str = "mean",
         learner_critics: bool = True,
         std_of: str = "learner",
-        log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
         **kwargs: Any,
     ):
-        super().__init__(observation_space, action_space, net_arch, activation_fn, **kwargs)
-        self.constructor_options |= {
-            "guider": guider,
-            "max_kl": max_kl,
-            "kl_reduction": kl_reduction,
-            "learner_critics": learner_critics,
-            "std_of": std_of,
-            "log_std_bounds": log_std_bounds,
-        }
-        owns_std = std_of == "learner"
-        self.learner = Learner(**self._role_kwargs("learner"), log_std_bounds=log_std_bounds, owns_std=owns_std)
-        shared = self.learner.features_extractor if self.share_features_extractor else None
-        bounds: dict[str, Any] = {"log_std_bounds": log_std_bounds, "max_kl": max_kl, "kl_reduction": kl_reduction}
-        self.guider = GUIDERS[guider](**self._role_kwargs("guider", shared), **bounds)
-        self.guider_critic, self.guider_critic_target = self._make_critic_and_target("guider_critic", shared)
-        self.learner_critic, self.learner_critic_target = None, None
-        if learner_critics:
-            self.learner_critic, self.learner_critic_target = self._make_critic_and_target("learner_critic", shared)
-        self._finish(lr_schedule, unclipped=len(self.learner.deployment_parameters()))
+        self.guider_class = GUIDERS[guider]
+        self.learner_critics = learner_critics
+        self.owns_std = std_of == "learner"
+        self.guider_options = {"max_kl": max_kl, "kl_reduction": kl_reduction}
+        self.own = {"guider": guider, "learner_critics": learner_critics, "std_of": std_of, **self.guider_options}
+        super().__init__(observation_space, action_space, lr_schedule, net_arch, activation_fn, **kwargs)
+
+    def own_options(self) -> dict[str, Any]:
+        """See :meth:`AsymmetricPolicy.own_options`."""
+        return self.own
+
+    def make_policy(self, role: str, **arguments: Any) -> RolePolicy:
+        """See :meth:`AsymmetricPolicy.make_policy`."""
+        if role == "learner":
+            return Learner(**arguments, owns_std=self.owns_std)
+        return self.guider_class(**arguments, **self.guider_options)
+
+    def has(self, role: str) -> bool:
+        """See :meth:`AsymmetricPolicy.has`."""
+        return role != "learner_critic" or self.learner_critics
+
+    def unclipped(self, role: str) -> int:
+        """See :meth:`AsymmetricPolicy.unclipped`; the learner's std, where it serves at deployment only."""
+        return len(self.learner.deployment_parameters()) if role == "learner" else 0
 
     @property
     def actor(self) -> LearnerAsActor:
@@ -117,9 +112,9 @@ class GACPolicy(AsymmetricPolicy):
         return self.guider_critic_target if self.learner_critic_target is None else self.learner_critic_target
 
     @property
-    def halves_are_independent(self) -> bool:
+    def branches_are_independent(self) -> bool:
         """Not where the learner climbs the guided critics."""
-        return self.learner_critic is not None and super().halves_are_independent
+        return self.learner_critic is not None and not self.share_features_extractor
 
     def distributions(self, obs: PyTorchObs) -> ActionDistributions:
         """
@@ -143,33 +138,22 @@ class GACPolicy(AsymmetricPolicy):
         guider = self.guider.relative_to(learner, guider)
         return ActionDistributions(guider, learner.borrowing(guider), learner)
 
-    def behaviour_action(
-        self,
-        observation: dict[str, np.ndarray],
-        state: BehaviourState = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, BehaviourState]:
-        """The guider's, see :meth:`AsymmetricPolicy.behaviour_action`; remembered are the learner's state and its own."""
-        obs, _ = self.obs_to_tensor(observation)
-        of_learner, of_guider = state or (None, None)
-        with th.no_grad():
-            learner, of_learner = self.learner.remember(obs, of_learner, episode_start)
-            guider, of_guider = self.guider.remember(obs, of_guider, episode_start)
-            action = self._chosen(self.combine(guider, learner).guider, deterministic)
-        return action, None if of_learner is None or of_guider is None else (of_learner, of_guider)
+    def action_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:
+        """See :meth:`AsymmetricPolicy.action_distributions`."""
+        both = self.combine(outputs["guider"], outputs["learner"])
+        return {"guider": both.guider, "learner": both.deployed}
 
 
 class GACGruPolicy(GACPolicy):
     """All networks with a GRU each."""
 
-    cell = "gru"
+    default_rnn_type = "gru"
 
 
 class GACLstmPolicy(GACPolicy):
     """All networks with an LSTM each."""
 
-    cell = "lstm"
+    default_rnn_type = "lstm"
 
 
 MultiInputPolicy = GACPolicy

@@ -20,6 +20,8 @@ Guided Actor-Critic paper.  Whatever must not receive a gradient (targets, froze
 detached by the caller, except in the dual loss, whose violation is always a constant.
 """
 
+import math
+
 import torch as th
 import torch.nn.functional as F
 
@@ -35,6 +37,23 @@ def masked_mean(values: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
     if mask is None:
         return values.mean()
     return th.where(mask > 0, values, th.zeros_like(values)).sum() / mask.sum().clamp(min=1)
+
+
+def masked_quantile(values: th.Tensor, share: float, mask: th.Tensor | None = None) -> th.Tensor:
+    """
+    Smallest value that at least a share of all values do not exceed, padding left out.
+
+    :param values: shape (\\*E)
+    :param share: in (0, 1]
+    :param mask: shape (\\*E), 1 for valid entries and 0 for padding; ``None`` if all are valid
+    :return: scalar
+    """
+    if mask is None:
+        return values.flatten().kthvalue(math.ceil(share * values.numel())).values
+    valid = mask.flatten() > 0
+    in_order = values.flatten().masked_fill(~valid, math.inf).sort().values  # no shape depends on the mask
+    rank = (share * valid.sum()).ceil().long().clamp(min=1) - 1
+    return in_order.gather(0, rank[None]).squeeze(0)
 
 
 def soft_target(
@@ -133,19 +152,18 @@ def log_std_loss(log_std: th.Tensor, guider_log_std: th.Tensor, mask: th.Tensor 
     return 0.5 * masked_mean((log_std - guider_log_std).square().mean(dim=-1), mask)
 
 
-def dual_loss(log_coef: th.Tensor, violation: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
+def dual_loss(coefficient: th.Tensor, violation: th.Tensor) -> th.Tensor:
     """
-    Loss of a dual variable in log space; its coefficient rises exactly while the constraint is violated.
+    Loss of dual variables; a coefficient rises exactly while its constraint is violated.
 
     For alpha (eq. 17, with the sign its text describes) the violation is KL - target_kl; for SAC's beta it is
     log mu + target_entropy.
 
-    :param log_coef: logarithm of the coefficient, shape () or (1,)
-    :param violation: shape (\\*E); treated as a constant
-    :param mask: shape (\\*E)
+    :param coefficient: shape (), (1,) or, one for each action dimension, (A,)
+    :param violation: mean over the batch, of the same shape or a scalar; treated as a constant
     :return: scalar
     """
-    return -(log_coef.exp() * masked_mean(violation.detach(), mask)).sum()
+    return -(coefficient * violation.detach()).sum()
 
 
 def _check_shapes(expected: th.Size, **tensors: th.Tensor | float | None) -> None:

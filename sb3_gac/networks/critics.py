@@ -82,7 +82,7 @@ class CriticEnsemble(RoleModel):
         What is needed of the observations, whatever the actions.
 
         :param obs: observation with at least the entries of this role, (\*E, ...) of each
-        :return: shape (B, F), or with a memory (N, T, B, F)
+        :return: shape (\*E, F), or with a memory (N, T, B, F)
         """
         features = self.extract_features(obs, self.features_extractor)
         return features if self.memory is None else self.memory(features)[0]
@@ -93,11 +93,11 @@ class CriticEnsemble(RoleModel):
         :param actions: see :meth:`forward`
         :return: see :meth:`forward`
         """
-        if self.memory is None:
-            return self._values(features.expand(self.n_critics, *features.shape), actions)
-        assert actions is None or actions.dim() == 3
+        members = features if self.memory is not None else features.expand(self.n_critics, *features.shape)
+        if members.dim() == 3:
+            return self._values(members, actions)
         flat_actions = None if actions is None else actions.flatten(0, 1)
-        return self._values(features.flatten(1, 2), flat_actions).unflatten(1, features.shape[1:3])
+        return self._values(members.flatten(1, 2), flat_actions).unflatten(1, members.shape[1:3])
 
     def _values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
         """

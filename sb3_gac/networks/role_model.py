@@ -15,8 +15,8 @@ class RoleModel(BaseModel):
     """
     A network that reads only the observation entries of its role, whatever else the observation holds.
 
-    With a ``memory`` (:class:`sb3_gac.networks.recurrent.Memory`) it takes sequences from an episode's start on, (T, B, ...)
-    of each entry instead of (B, ...).
+    With a ``memory`` (:class:`sb3_gac.networks.recurrent.Memory`) it needs sequences from an episode's start on, (T, B, ...)
+    of each entry instead of (B, ...); without one it takes either.
 
     Where the learner's encoder is shared, ``features_extractor`` is the learner's, which the learner's loss alone
     trains, and ``rest_extractor`` encodes the entries that the learner does not read.
@@ -42,10 +42,10 @@ class RoleModel(BaseModel):
         if isinstance(extractor, VectorExtractor):
             return extractor(obs)
         entries = {key: obs[key] for key in space.spaces}  # type: ignore[index]
-        leading: list[int] = []
-        if self.memory is not None:  # encoders know one leading dimension, sequences have two
-            leading = list(next(iter(entries.values())).shape[:2])
+        key, value = next(iter(entries.items()))
+        leading = list(value.shape[: value.dim() - len(space[key].shape or ())])
+        if len(leading) > 1:  # encoders know one leading dimension, sequences have two
             entries = {key: value.flatten(0, 1) for key, value in entries.items()}
         features = extractor({key: encode(value, space[key], self.normalize_images) for key, value in entries.items()})
         # not unflatten, which ONNX would do for the example's batch alone
-        return features.reshape(*leading, -1) if leading else features
+        return features.reshape(*leading, -1) if len(leading) > 1 else features

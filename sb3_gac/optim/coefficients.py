@@ -1,13 +1,18 @@
-"""Coefficients of a Lagrangian: learned (a dual variable with bounds and its own optimiser) or fixed."""
+"""
+Coefficients of a Lagrangian: fixed, learned as dual variables, or moved by steps.
+
+All have a ``value`` to multiply with, ``update(violation)`` to learn from, and say what of them a file has to keep.
+"""
 
 import math
 from typing import Any
 
 import torch as th
+import torch.nn.functional as F
 
 from sb3_gac.checks.values import check_range
-from sb3_gac.math.losses import dual_loss
-from sb3_gac.optim.flat import FlatAdam
+from sb3_gac.math.losses import dual_loss, masked_mean
+from sb3_gac.optim.trained import TrainedParameters, adam_step
 
 
 class FixedCoefficient:
@@ -18,10 +23,15 @@ class FixedCoefficient:
     :param device: where its tensor lives
     """
 
+    #: Names of what a file has to keep: of optimisers, and of tensors
+    state_names: tuple[list[str], list[str]] = ([], ["value"])
+    optimizer: th.optim.Optimizer | None = None
+
     def __init__(self, value: float, device: th.device):
         self.value = th.tensor(float(value), device=device)
-        self.optimizer: th.optim.Optimizer | None = None
-        self.state_names: tuple[list[str], list[str]] = ([], ["value"])
+
+    def refresh(self) -> None:
+        """To be called before training: a file's state may have been loaded."""
 
     def update(self, violation: th.Tensor, mask: th.Tensor | None = None) -> dict[str, th.Tensor]:
         """Nothing to learn, and no loss."""
@@ -30,34 +40,94 @@ class FixedCoefficient:
     def go_on_from(self, other: "Coefficient") -> None:
         """It is what it was told to be."""
 
-    def on_bound(self) -> th.Tensor:
+    def at_bound(self) -> th.Tensor:
         """It has none: zero."""
         return th.zeros_like(self.value)
 
 
-class DualVariable:
+class AdditiveCoefficient(FixedCoefficient):
     """
-    A positive coefficient learned in log space by gradient steps on :func:`dual_loss`, kept inside bounds.
+    A coefficient that is moved by steps of one size, up or down, and not by gradients.
+
+    :param value: at the start
+    :param step: size of a step
+    :param bounds: smallest and largest value
+    :param device: where its tensor lives
+    """
+
+    def __init__(self, value: float, step: float, bounds: tuple[float, float], device: th.device):
+        super().__init__(value, device)
+        self.step = step
+        self.bounds = bounds
+
+    def move(self, direction: float) -> None:
+        """
+        :param direction: number of steps, negative for down
+        """
+        self.value.add_(self.step * direction).clamp_(*self.bounds)
+
+    def at_bound(self) -> th.Tensor:
+        """1 if the coefficient sits on one of its bounds, else 0, scalar."""
+        low, high = self.bounds
+        return ((self.value <= low) | (self.value >= high)).float()
+
+
+class SoftplusDual:
+    """
+    Positive coefficients softplus(x), x learned by gradient steps on a dual loss: they rise while constraints are violated.
 
     :param name: what its loss is named after
     :param initial: start value, inside the bounds
     :param bounds: smallest and largest value
-    :param learning_rate: Adam's, on the logarithm
+    :param learning_rate: Adam's, on x
     :param device: where its tensor lives
+    :param shape: () for one coefficient, (A,) for one of each action dimension
     """
 
-    def __init__(self, name: str, initial: float, bounds: tuple[float, float], learning_rate: float, device: th.device):
+    state_names: tuple[list[str], list[str]] = (["optimizer"], ["parameter"])
+
+    def __init__(
+        self,
+        name: str,
+        initial: float,
+        bounds: tuple[float, float],
+        learning_rate: float,
+        device: th.device,
+        shape: tuple[int, ...] = (),
+    ):
         self.name = name
         self.bounds = bounds
-        self._log_bounds = (math.log(bounds[0]), math.log(bounds[1]))
-        self.log_value = th.full((1,), math.log(initial), device=device, requires_grad=True)
-        self.optimizer: th.optim.Optimizer | None = FlatAdam([self.log_value], lr=learning_rate)
-        self.state_names: tuple[list[str], list[str]] = (["optimizer"], ["log_value"])
+        self.shape = shape
+        low, high, start = (self._inverse(value) for value in (*bounds, initial))
+        self._parameter_bounds = low, high
+        self.parameter = th.full(shape or (1,), start, device=device, requires_grad=True)
+        self.optimizer: th.optim.Optimizer | None = th.optim.Adam([self.parameter], lr=learning_rate, fused=True)
+        self._trained = TrainedParameters([self.parameter], self.optimizer)  # type: ignore[list-item]
+
+    @staticmethod
+    def _inverse(value: float) -> float:
+        """
+        :param value: of a coefficient
+        :return: x
+        """
+        return value + math.log(-math.expm1(-value))
+
+    @staticmethod
+    def _value_and_slope(parameter: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param parameter: x
+        :return: coefficient, and its derivative by x
+        """
+        return F.softplus(parameter), parameter.sigmoid()
 
     @property
     def value(self) -> th.Tensor:
-        """The coefficient, detached, scalar."""
-        return self.log_value.detach().exp().squeeze(0)
+        """The coefficients, detached, of the shape that was asked for."""
+        return self._value_and_slope(self.parameter.detach())[0].view(self.shape)
+
+    def refresh(self) -> None:
+        """To be called before training: a file's state may have been loaded, or the learning rate set."""
+        self._trained.refresh()
 
     def go_on_from(self, other: "Coefficient") -> None:
         """
@@ -65,39 +135,62 @@ class DualVariable:
 
         :param other: learned as well
         """
-        assert isinstance(other, DualVariable)
+        assert isinstance(other, SoftplusDual)
         assert self.optimizer is not None
         assert other.optimizer is not None
         learning_rate = self.optimizer.param_groups[0]["lr"]
         with th.no_grad():
-            self.log_value.copy_(other.log_value).clamp_(*self._log_bounds)
+            self.parameter.copy_(other.parameter).clamp_(*self._parameter_bounds)
         self.optimizer.load_state_dict(other.optimizer.state_dict())
         self.optimizer.param_groups[0]["lr"] = learning_rate
+        self.refresh()
 
-    def on_bound(self) -> th.Tensor:
-        """1 if the coefficient sits on one of its bounds, else 0, scalar."""
-        low, high = self._log_bounds
-        log_value = self.log_value.detach().squeeze(0)
-        return ((log_value <= low) | (log_value >= high)).float()
+    def at_bound(self) -> th.Tensor:
+        """1 if the coefficient sits on one of its bounds, else 0; the mean over dimensions, scalar."""
+        low, high = self._parameter_bounds
+        parameter = self.parameter.detach()
+        return ((parameter <= low) | (parameter >= high)).float().mean()
 
     def update(self, violation: th.Tensor, mask: th.Tensor | None = None) -> dict[str, th.Tensor]:
-        """
-        One gradient step: up while the mean violation is positive, down while it is negative.
+        r"""
+        One gradient step on :func:`sb3_gac.math.losses.dual_loss`: up while the mean violation is positive, down while it is
+        negative.
 
-        :param violation: constraint violation per sample, shape (\\*E)
-        :param mask: shape (\\*E), 1 for valid samples; ``None`` if all are
+        :param violation: of the constraint per sample, shape (\*E), or (\*E, A) for one coefficient a dimension; or its mean
+        :param mask: shape (\*E), 1 for valid samples; ``None`` if all are
         :return: loss to log, detached, scalar
         """
+        assert self._trained.adam is not None
         assert self.optimizer is not None
         with th.no_grad():
-            loss = dual_loss(self.log_value, violation, mask)
-            self.log_value.grad = loss.view(1)  # d/dx (-exp(x) v) = -exp(x) v: the gradient is the loss itself
-            self.optimizer.step()
-            self.log_value.clamp_(*self._log_bounds)
-        return {f"{self.name}_loss": loss}
+            mean = violation.reshape(-1, *self.shape).mean(dim=0) if mask is None else masked_mean(violation, mask)
+            value, slope = self._value_and_slope(self.parameter)
+            adam_step(self._trained.adam, [-slope * mean], self.optimizer.param_groups[0])
+            self.parameter.clamp_(*self._parameter_bounds)
+        return {f"{self.name}_loss": dual_loss(value, mean)}
 
 
-Coefficient = FixedCoefficient | DualVariable
+class DualVariable(SoftplusDual):
+    """A dual variable exp(x), as SAC's temperature: steps are relative to its size."""
+
+    state_names = (["optimizer"], ["log_value"])
+
+    @property
+    def log_value(self) -> th.Tensor:
+        """Its logarithm, shape (1,) of a single one."""
+        return self.parameter
+
+    @staticmethod
+    def _inverse(value: float) -> float:
+        return math.log(value)
+
+    @staticmethod
+    def _value_and_slope(parameter: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        value = parameter.exp()
+        return value, value
+
+
+Coefficient = FixedCoefficient | SoftplusDual
 
 
 def make_coefficient(

@@ -1,10 +1,10 @@
 """
-Two halves of a gradient step at once, on the CPU.
+Two branches of a gradient step at once, on the CPU.
 
 The networks of this package are small: one matrix product of theirs does not fill two cores, but guider and learner, each
-with critics of its own, are independent of each other for most of a step.  A worker thread takes one half, the calling
+with critics of its own, are independent of each other for most of a step.  A worker thread takes one branch, the calling
 thread the other, each with half of torch's threads.  (Python's lock is free during every product.)  Results are those of
-the two halves one after the other.
+the two branches one after the other.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,14 +33,11 @@ def _with_threads(task: Callable[[], T], threads: int) -> T:
     return task()
 
 
-def run_halves(tasks: Sequence[Callable[[], Any]], together: bool) -> list[Any]:
+def run_side_by_side(tasks: Sequence[Callable[[], Any]]) -> list[Any]:
     """
-    :param tasks: one or two that share nothing that either changes; random numbers must be drawn before
-    :param together: whether to run them at once; an error in either is raised either way
-    :return: their results, in order
+    :param tasks: two that share nothing that either changes; random numbers must be drawn before
+    :return: their results, in order; an error in either is raised
     """
-    if not together or len(tasks) < 2:
-        return [task() for task in tasks]
     first, second = tasks
     future = _worker().submit(_with_threads, second, th.get_num_threads())
     try:
@@ -53,7 +50,7 @@ def run_halves(tasks: Sequence[Callable[[], Any]], together: bool) -> list[Any]:
 
 
 def has_side_effects(module: nn.Module) -> bool:
-    """Whether a forward pass draws random numbers or changes statistics: then its halves must keep their order."""
+    """Whether a forward pass draws random numbers or changes statistics: then branches must keep their order."""
     return any(isinstance(part, (_DropoutNd, _BatchNorm)) for part in module.modules())
 
 

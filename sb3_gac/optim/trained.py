@@ -1,0 +1,165 @@
+"""
+The parameters of a network that are trained, and one step of its optimiser.
+
+What Adam keeps of each parameter is looked up once a round of gradient steps instead of once a step: at 256 units and less
+that bookkeeping takes as long as the arithmetic.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch as th
+from torch import nn
+
+
+class AdamTensors(NamedTuple):
+    """
+    What one step of Adam reads and changes, in place.
+
+    :param parameters: of one network
+    :param exp_avgs: running mean of each one's gradient
+    :param exp_avg_sqs: running mean of its square
+    :param steps: taken so far, of each one, scalars
+    :param learning_rate: scalar
+    """
+
+    parameters: list[th.Tensor]
+    exp_avgs: list[th.Tensor]
+    exp_avg_sqs: list[th.Tensor]
+    steps: list[th.Tensor]
+    learning_rate: th.Tensor
+
+
+class TrainedParameters:
+    """
+    Those parameters of a network that are trainable, of which any may be frozen and unfrozen at any time.
+
+    No gradient, momentum or weight decay moves a frozen one; what the optimiser knew of it is forgotten.
+
+    :param parameters: of one network
+    :param optimizer: of all of them, in one group; torch's Adam and AdamW take the fast way, if their options allow it
+    :param unclipped: how many of the last parameters have no say in the gradient's norm and its bound
+    """
+
+    def __init__(self, parameters: Sequence[nn.Parameter], optimizer: th.optim.Optimizer, unclipped: int = 0):
+        self.everything = list(parameters)
+        self.optimizer = optimizer
+        self._clips = [index < len(self.everything) - unclipped for index in range(len(self.everything))]
+        self._state: object = None
+        self.trained: list[bool] = []
+        self.refresh()
+
+    @property
+    def can_be_compiled(self) -> bool:
+        """Whether :meth:`step` is made of tensor operations alone."""
+        return self.adam is not None
+
+    def refresh(self) -> None:
+        """To be called before training and before saving: parameters may have been frozen, and a file's state loaded."""
+        trained = [parameter.requires_grad for parameter in self.everything]
+        group = self.optimizer.param_groups[0]
+        if trained != self.trained or self.optimizer.state is not self._state:
+            self.trained, self._state = trained, self.optimizer.state
+            self.parameters = [p for p in self.everything if p.requires_grad]
+            self.clipped = [clips for clips, p in zip(self._clips, self.everything, strict=True) if p.requires_grad]
+            for parameter in self.everything:
+                if not parameter.requires_grad:
+                    self.optimizer.state.pop(parameter, None)
+            self.adam = self._gathered() if _is_plain_adam(self.optimizer) else None
+        if self.adam is not None:
+            self.adam.learning_rate.fill_(group["lr"])
+        group["trained"] = trained
+
+    def _gathered(self) -> AdamTensors:
+        for parameter in self.parameters:
+            state = self.optimizer.state[parameter]
+            if not state:
+                state["step"] = th.zeros((), device=parameter.device)
+                state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(parameter), th.zeros_like(parameter)
+        states = [self.optimizer.state[parameter] for parameter in self.parameters]
+        of_each = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
+        learning_rate = th.zeros((), device=self.everything[0].device if self.everything else None)
+        return AdamTensors(list(self.parameters), *of_each, learning_rate)
+
+    def freeze_as_saved(self) -> None:
+        """Freeze and unfreeze the parameters as they were when the optimiser's state was saved."""
+        for parameter, trained in zip(self.everything, self.optimizer.param_groups[0].get("trained", self.trained), strict=True):
+            parameter.requires_grad_(trained)
+
+    def step(self, gradients: Sequence[th.Tensor], max_norm: float | None) -> th.Tensor:
+        """
+        One step of the optimiser.
+
+        :param gradients: of each trained parameter
+        :param max_norm: scale the gradients to a norm of at most this; ``None`` leaves them as they are
+        :return: norm of the gradients before, scalar
+        """
+        gradients, norm = self._clip(gradients, max_norm)
+        if not gradients:
+            return norm
+        with th.no_grad():
+            if self.adam is not None:
+                adam_step(self.adam, gradients, self.optimizer.param_groups[0])
+            else:
+                for parameter, gradient in zip(self.parameters, gradients, strict=True):
+                    parameter.grad = gradient
+                self.optimizer.step()
+        return norm
+
+    def _clip(self, gradients: Sequence[th.Tensor], max_norm: float | None) -> tuple[list[th.Tensor], th.Tensor]:
+        bounded = [gradient for gradient, clips in zip(gradients, self.clipped, strict=True) if clips]
+        if not bounded:
+            return list(gradients), th.zeros((), device=self.everything[0].device if self.everything else None)
+        norm = th.linalg.vector_norm(th.stack([th.linalg.vector_norm(gradient) for gradient in bounded]))
+        if max_norm is None:
+            return list(gradients), norm
+        scaled = iter(th._foreach_mul(bounded, (max_norm / (norm + 1e-6)).clamp(max=1.0)))
+        return [next(scaled) if clips else g for g, clips in zip(gradients, self.clipped, strict=True)], norm
+
+
+def _is_plain_adam(optimizer: th.optim.Optimizer) -> bool:
+    """Whether the optimiser is torch's Adam or AdamW with the options that :func:`adam_step` knows."""
+    group = optimizer.param_groups[0]
+    plain = type(optimizer) in (th.optim.Adam, th.optim.AdamW) and group["fused"] is True
+    return plain and not any(group[name] for name in ("amsgrad", "maximize", "differentiable"))
+
+
+def adam_step(adam: AdamTensors, gradients: Sequence[th.Tensor], options: dict) -> None:
+    """
+    One step of Adam, or of AdamW where weight decay is decoupled.
+
+    :param adam: is changed in place
+    :param gradients: of each parameter
+    :param options: of the optimiser's group
+    """
+    decoupled, weight_decay, eps = options["decoupled_weight_decay"], options["weight_decay"], options["eps"]
+    beta1, beta2 = options["betas"]
+    th._foreach_add_(adam.steps, 1)
+    if not th.compiler.is_compiling():
+        fused = th._fused_adamw_ if decoupled else th._fused_adam_
+        fused(
+            adam.parameters,
+            list(gradients),
+            adam.exp_avgs,
+            adam.exp_avg_sqs,
+            [],
+            adam.steps,
+            lr=options["lr"],
+            beta1=beta1,
+            beta2=beta2,
+            weight_decay=weight_decay,
+            eps=eps,
+            amsgrad=False,
+            maximize=False,
+        )
+        return
+    moments = zip(adam.parameters, gradients, adam.exp_avgs, adam.exp_avg_sqs, adam.steps, strict=True)
+    for parameter, gradient, mean, square, step in moments:
+        if decoupled:
+            parameter.mul_(1 - adam.learning_rate * weight_decay)
+        elif weight_decay:
+            gradient = gradient + weight_decay * parameter
+        mean.lerp_(gradient, 1 - beta1)
+        square.lerp_(gradient.square(), 1 - beta2)
+        spread = (square / (1 - beta2**step)).sqrt() + eps
+        parameter.sub_(adam.learning_rate * mean / (1 - beta1**step) / spread)
