@@ -1,18 +1,17 @@
 """Guided Actor-Critic."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
-import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from typing_extensions import Unpack
 
-from sb3_gac.base.roles import RoleKeys
-from sb3_gac.checks.arguments import PlainSchedule
+from sb3_gac.base.arguments import OffPolicyArguments
+from sb3_gac.checks.arguments import ArgumentCheck, PlainSchedule, check_switch, unless
 from sb3_gac.checks.entries import check_is_observation
 from sb3_gac.checks.values import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.gac.actors import GUIDERS
@@ -53,28 +52,23 @@ class GAC(GuidedUpdate):
         "MultiInputLstmPolicy": GACLstmPolicy,
     }
 
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {
+        "target_kl": partial(check_schedule, remedy="for example the default 0.0033, or a schedule of such"),
+        "kl_coef_learning_rate": check_positive,
+        "kl_reduction": partial(check_choice, choices=KL_REDUCTIONS),
+        "guider": partial(check_choice, choices=GUIDERS),
+        "max_kl": unless(None, check_positive, remedy="or None for no hard bound"),
+        "std_of": partial(check_choice, choices=("auto", *STD_OF)),
+        "learner_kl_scale": unless("auto", check_not_negative, remedy='or "auto"'),
+        "learner_entropy": check_switch,
+    }
     restored_arguments = (*GuidedUpdate.restored_arguments, "kl_coef", "kl_coef_bounds", "kl_coef_learning_rate")
 
     def __init__(
         self,
         policy: str | type[GACPolicy],
         env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        buffer_size: int = 1_000_000,
-        learning_starts: int = 100,
-        batch_size: int = 256,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        train_freq: int | tuple[int, str] = 1,
-        gradient_steps: int = 1,
-        action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 1,
-        ent_coef: str | float = "auto",
-        target_update_interval: int = 1,
-        target_entropy: str | float = "auto",
+        *sb3: Any,
         target_kl: float | Schedule = 0.0033,
         kl_coef: str | float = "auto",
         kl_coef_bounds: tuple[float, float] = (1e-4, 100.0),
@@ -85,51 +79,8 @@ class GAC(GuidedUpdate):
         std_of: str = "auto",
         learner_kl_scale: str | float = "auto",
         learner_entropy: bool = True,
-        max_grad_norm: float | None = 1.0,
-        lr_scales: Mapping[str, float] | None = None,
-        role_keys: RoleKeys | None = None,
-        compile: bool = False,
-        mixed_precision: bool = False,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
-        _init_setup_model: bool = True,
+        **shared: Unpack[OffPolicyArguments],
     ):
-        super().__init__(
-            policy,
-            env,
-            learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            train_freq,
-            gradient_steps,
-            action_noise,
-            replay_buffer_class,
-            replay_buffer_kwargs,
-            optimize_memory_usage,
-            n_steps,
-            ent_coef,
-            target_update_interval,
-            target_entropy,
-            max_grad_norm,
-            lr_scales,
-            role_keys,
-            compile,
-            mixed_precision,
-            stats_window_size,
-            tensorboard_log,
-            policy_kwargs,
-            verbose,
-            seed,
-            device,
-            _init_setup_model=False,
-        )
         self.target_kl = target_kl
         self.kl_coef = kl_coef
         self.kl_coef_bounds = kl_coef_bounds
@@ -140,30 +91,19 @@ class GAC(GuidedUpdate):
         self.std_of = std_of
         self.learner_kl_scale = learner_kl_scale
         self.learner_entropy = learner_entropy
-        if _init_setup_model:
-            self._setup_model()
+        super().__init__(policy, env, *sb3, **shared)
 
     # --- set-up -----------------------------------------------------------------------------------------------------
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_schedule("target_kl", self.target_kl, remedy="for example the default 0.0033, or a schedule of such")
-        check_positive("kl_coef_learning_rate", self.kl_coef_learning_rate)
-        check_choice("kl_reduction", self.kl_reduction, KL_REDUCTIONS)
-        check_choice("learner_entropy", self.learner_entropy, (False, True))
-        check_choice("guider", self.guider, GUIDERS)
-        check_choice("std_of", self.std_of, ("auto", *STD_OF))
         if self.std_of == "learner" and not self._learner_can_train_a_std():
             raise ValueError(
                 'std_of="learner" needs an entropy term in the learner\'s objective, or nothing keeps its std from falling: '
                 'leave std_of "auto", or give GAC or GACShare learner_entropy=True.'
             )
-        if self.max_kl is not None:
-            check_positive("max_kl", self.max_kl, remedy="or None for no hard bound")
-            if not isinstance(self.action_space, spaces.Box):
-                raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
-        if self.learner_kl_scale != "auto":
-            check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
+        if self.max_kl is not None and not isinstance(self.action_space, spaces.Box):
+            raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
 
     def _learner_can_train_a_std(self) -> bool:
         return self.learner_entropy
