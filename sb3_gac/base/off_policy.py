@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self, Unpack
 
-from sb3_gac.base.arguments import ConstructorArguments, OffPolicyArguments, with_defaults
+from sb3_gac.base.arguments import ConstructorArguments, OffPolicyArguments, present_names, with_defaults
 from sb3_gac.base.overrides import algorithm_of, check_known
 from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
 from sb3_gac.base.resuming import ResumableAlgorithm
@@ -226,7 +226,7 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
             self.action_noise = VectorizedActionNoise(base, self.n_envs) if self.n_envs > 1 else base
 
     def _all_policy_kwargs(self) -> dict[str, Any]:
-        return {**self._policy_options(), **self.policy_kwargs}
+        return {**self._policy_options(), **present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")}
 
     def _policy_options(self) -> dict[str, Any]:
         """Arguments of the policy class that are arguments of the algorithm."""

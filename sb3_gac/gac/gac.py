@@ -15,7 +15,7 @@ from sb3_gac.checks.arguments import ArgumentCheck, PlainSchedule, check_switch,
 from sb3_gac.checks.entries import check_is_observation
 from sb3_gac.checks.values import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.gac.actors import GUIDERS
-from sb3_gac.gac.policies import STD_OF, GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
+from sb3_gac.gac.policies import SHARED_STDS, GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
 from sb3_gac.gac.update import GuidedUpdate
 from sb3_gac.math.distributions import KL_REDUCTIONS
 from sb3_gac.optim.coefficients import make_coefficient
@@ -37,7 +37,7 @@ class GAC(GuidedUpdate):
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
     :param guider: "residual": learner plus a privileged correction; "independent": a network of its own (the paper's)
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
-    :param std_of: whose standard deviation both policies have, "learner" or "guider"; the other borrows it as a constant.
+    :param shared_std: whose standard deviation both policies have, "learner" or "guider"; the other borrows it as a constant.
         "auto" is the guider's, the paper's, unless the guider is residual and the learner has an entropy term
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
         is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
@@ -58,10 +58,11 @@ class GAC(GuidedUpdate):
         "kl_reduction": partial(check_choice, choices=KL_REDUCTIONS),
         "guider": partial(check_choice, choices=GUIDERS),
         "max_kl": unless(None, check_positive, remedy="or None for no hard bound"),
-        "std_of": partial(check_choice, choices=("auto", *STD_OF)),
+        "shared_std": partial(check_choice, choices=("auto", *SHARED_STDS)),
         "learner_kl_scale": unless("auto", check_not_negative, remedy='or "auto"'),
         "learner_entropy": check_switch,
     }
+    renamed_arguments: ClassVar[Mapping[str, str]] = {"std_of": "shared_std"}
     restored_arguments = (*GuidedUpdate.restored_arguments, "kl_coef", "kl_coef_bounds", "kl_coef_learning_rate")
 
     def __init__(
@@ -76,7 +77,7 @@ class GAC(GuidedUpdate):
         kl_reduction: str = "mean",
         guider: str = "residual",
         max_kl: float | None = None,
-        std_of: str = "auto",
+        shared_std: str = "auto",
         learner_kl_scale: str | float = "auto",
         learner_entropy: bool = True,
         **shared: Unpack[OffPolicyArguments],
@@ -88,7 +89,7 @@ class GAC(GuidedUpdate):
         self.kl_reduction = kl_reduction
         self.guider = guider
         self.max_kl = max_kl
-        self.std_of = std_of
+        self.shared_std = shared_std
         self.learner_kl_scale = learner_kl_scale
         self.learner_entropy = learner_entropy
         super().__init__(policy, env, *sb3, **shared)
@@ -97,10 +98,10 @@ class GAC(GuidedUpdate):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        if self.std_of == "learner" and not self._learner_can_train_a_std():
+        if self.shared_std == "learner" and not self._learner_can_train_a_std():
             raise ValueError(
-                'std_of="learner" needs an entropy term in the learner\'s objective, or nothing keeps its std from falling: '
-                'leave std_of "auto", or give GAC or GACShare learner_entropy=True.'
+                'shared_std="learner" needs an entropy term in the learner\'s objective, or nothing keeps its std from '
+                'falling: leave shared_std "auto", or give GAC or GACShare learner_entropy=True.'
             )
         if self.max_kl is not None and not isinstance(self.action_space, spaces.Box):
             raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
@@ -114,7 +115,7 @@ class GAC(GuidedUpdate):
             "guider": self.guider,
             "max_kl": self.max_kl,
             "kl_reduction": self.kl_reduction,
-            "std_of": self.std_of if self.std_of != "auto" else ("learner" if own else "guider"),
+            "shared_std": self.shared_std if self.shared_std != "auto" else ("learner" if own else "guider"),
         }
 
     def _setup_coefficients(self) -> None:

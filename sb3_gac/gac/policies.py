@@ -1,6 +1,7 @@
 """Guider, learner and four critics: the networks of Guided Actor-Critic for Box and Discrete actions."""
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
@@ -8,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_gac.base.arguments import ConstructorArguments
 from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
 from sb3_gac.base.roles import Roles
 from sb3_gac.gac.actors import GUIDERS, Learner, LearnerAsActor
@@ -15,7 +17,7 @@ from sb3_gac.math.distributions import Distribution
 from sb3_gac.networks.critics import CriticEnsemble
 from sb3_gac.networks.heads import LOG_STD_BOUNDS
 
-STD_OF = ("learner", "guider")
+SHARED_STDS = ("learner", "guider")
 
 
 class ActionDistributions(NamedTuple):
@@ -33,7 +35,7 @@ class ActionDistributions(NamedTuple):
     deployed: Any
 
 
-class GACPolicy(AsymmetricPolicy):
+class GACPolicy(ConstructorArguments, AsymmetricPolicy):
     """
     All networks of GAC and their optimisers. As a policy it is the learner: ``predict`` needs its entries alone.
 
@@ -47,8 +49,8 @@ class GACPolicy(AsymmetricPolicy):
     :param max_kl: hard bound on KL(guider || learner), or ``None``
     :param kl_reduction: how that KL is reduced over action dimensions, "mean" or "sum"
     :param learner_critics: whether the learner has critics of its own
-    :param std_of: whose std both Gaussians have, one of ``STD_OF``; what the other's network says of its own counts at most
-        at deployment
+    :param shared_std: whose std both Gaussians have, one of ``SHARED_STDS``; what the other's network says of its own counts
+        at most at deployment
     :param log_std_bounds: smallest and largest log standard deviation before tanh
     :param features_extractor_class: encoder, made once per role on the entries of that role
     :param features_extractor_kwargs: keyword arguments for it
@@ -64,6 +66,7 @@ class GACPolicy(AsymmetricPolicy):
     learner_critic: CriticEnsemble | None
     learner_critic_target: CriticEnsemble | None
 
+    renamed_arguments: ClassVar[Mapping[str, str]] = {"std_of": "shared_std"}
     roles = Roles("learner", ("guider", "guider_critic", "learner_critic"))
 
     def __init__(
@@ -77,7 +80,7 @@ class GACPolicy(AsymmetricPolicy):
         max_kl: float | None = None,
         kl_reduction: str = "mean",
         learner_critics: bool = True,
-        std_of: str = "learner",
+        shared_std: str = "learner",
         log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
         **kwargs: Any,
     ):
@@ -87,10 +90,10 @@ class GACPolicy(AsymmetricPolicy):
             "max_kl": max_kl,
             "kl_reduction": kl_reduction,
             "learner_critics": learner_critics,
-            "std_of": std_of,
+            "shared_std": shared_std,
             "log_std_bounds": log_std_bounds,
         }
-        owns_std = std_of == "learner"
+        owns_std = shared_std == "learner"
         self.learner = Learner(**self._role_kwargs("learner"), log_std_bounds=log_std_bounds, owns_std=owns_std)
         shared = self.learner.features_extractor if self.share_features_extractor else None
         bounds: dict[str, Any] = {"log_std_bounds": log_std_bounds, "max_kl": max_kl, "kl_reduction": kl_reduction}

@@ -295,3 +295,49 @@ def test_files_with_former_names_are_read_without_a_warning(how, cls, tmp_path, 
     assert {name: getattr(again, name) for name in values} == values
     assert given.tau == 0.75
     assert not set(RENAMED[cls]) & set(vars(again))
+
+
+GUIDED = [GAC, GACShare, GACWithoutQ]
+
+
+@pytest.mark.parametrize("cls", GUIDED)
+def test_std_of_is_shared_std(cls, tmp_path):
+    with pytest.warns(DeprecationWarning, match=rf'{cls.__name__}\(\) got "std_of", which is "shared_std" now'):
+        model = small_model(cls=cls, std_of="guider").learn(5)
+    assert model.shared_std == model.policy.constructor_options["shared_std"] == "guider"
+    with pytest.warns(DeprecationWarning, match=f"{cls.__name__}.std_of is {cls.__name__}.shared_std now"):
+        assert model.std_of == "guider"
+    for how in HOW:
+        _saved(how, model, tmp_path / how)
+        with pytest.warns(DeprecationWarning, match=rf'{how}\(\) got "std_of"'):
+            assert _again(how, cls, tmp_path / how, std_of="guider").shared_std == "guider"
+
+
+@pytest.mark.parametrize("cls", GUIDED)
+def test_std_of_in_files(cls, tmp_path, monkeypatch):
+    monkeypatch.setitem(RENAMED, cls, {"std_of": ("shared_std", "guider")})
+    for how in HOW:
+        model = small_model(cls=cls, shared_std="guider").learn(15)
+        (tmp_path / how).mkdir()
+        _saved_as_before(how, model, tmp_path / how, monkeypatch)
+        again = _again(how, cls, tmp_path / how)
+        assert again.shared_std == again.policy.constructor_options["shared_std"] == "guider"
+        assert not again.policy.learner.owns_std
+
+
+def test_std_of_of_a_policy_is_shared_std(tmp_path):
+    with pytest.warns(DeprecationWarning, match='policy_kwargs got "std_of", which is "shared_std" now'):
+        model = small_model(policy_kwargs={"net_arch": [8], "std_of": "guider"})
+    assert not model.policy.learner.owns_std
+    model.save(tmp_path / "model")
+    with pytest.warns(DeprecationWarning, match='policy_kwargs got "std_of"'):
+        assert not GAC.load(tmp_path / "model").policy.learner.owns_std
+    options = model.policy.constructor_options
+    options["std_of"] = options.pop("shared_std")
+    model.policy.save(tmp_path / "policy")
+    with pytest.warns(DeprecationWarning, match=r'GACPolicy\(\) got "std_of", which is "shared_std" now'):
+        loaded = type(model.policy).load(tmp_path / "policy")
+    assert loaded.constructor_options["shared_std"] == "guider"
+    parameters = inspect.signature(type(model.policy)).parameters
+    assert {"shared_std", "n_critics"} <= set(parameters)
+    assert "std_of" not in parameters

@@ -89,9 +89,9 @@ def test_a_whole_network_frozen_after_construction_stays_and_the_others_train(cl
 
 
 @pytest.mark.parametrize("part", ["head.mean", "head.log_std", "latent_net"])
-@pytest.mark.parametrize("std_of", ["learner", "guider"])
-def test_parts_of_the_learner(part, std_of):
-    model = small_model(std_of=std_of, learning_rate=1e-2).learn(15)
+@pytest.mark.parametrize("shared_std", ["learner", "guider"])
+def test_parts_of_the_learner(part, shared_std):
+    model = small_model(shared_std=shared_std, learning_rate=1e-2).learn(15)
     parts = {name: model.policy.learner.get_submodule(name) for name in ("head.mean", "head.log_std", "latent_net")}
     parts[part].requires_grad_(False)
     before = {name: _parameters(module) for name, module in parts.items()}
