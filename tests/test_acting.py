@@ -66,10 +66,10 @@ def test_the_behaviour_policy_explores_unless_it_is_asked_not_to(cls, discrete):
 
 
 @pytest.mark.parametrize("guider", ["residual", "independent"])
-@pytest.mark.parametrize("std_of", ["learner", "guider"])
-def test_what_the_guider_does_is_what_its_distribution_says(guider, std_of):
+@pytest.mark.parametrize("shared_std", ["learner", "guider"])
+def test_what_the_guider_does_is_what_its_distribution_says(guider, shared_std):
     """Its mode in the environment's range; and about that the std that both policies have."""
-    model = small_model(Recorded(), guider=guider, std_of=std_of)
+    model = small_model(Recorded(), guider=guider, shared_std=shared_std)
     unlike_each_other(model.policy, scale=0.2)
     obs = {"partial": np.full((4000, 3), 0.3, np.float32), "privileged": np.full((4000, 2), -0.2, np.float32)}
     with th.no_grad():

@@ -43,8 +43,8 @@ class Case:
     normalised: bool = False
 
 
-OWN = {"std_of": "learner"}
-GUIDERS_STD = {"std_of": "guider"}
+OWN = {"shared_std": "learner"}
+GUIDERS_STD = {"shared_std": "guider"}
 INDEPENDENT = {"guider": "independent"}
 SUM = {"kl_reduction": "sum", "target_kl": 0.4}
 CLIPPED = {"max_grad_norm": 0.5}

@@ -12,9 +12,10 @@ from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self
 
+from sb3_gac.base.arguments import needed_arguments_from, present_names
 from sb3_gac.base.collecting import DataCollection
 from sb3_gac.base.overrides import check_names, check_unchanged, check_whose
-from sb3_gac.checks.arguments import KEPT_AS, check_train_freq
+from sb3_gac.checks.arguments import KEPT_AS, check_train_freq, merged
 from sb3_gac.checks.environments import FAULTS
 from sb3_gac.checks.values import as_sentence, check_same_spaces
 
@@ -51,7 +52,7 @@ class FaultTolerance(DataCollection):
                 _check_number(buffer, env.num_envs, f"{type(self).__name__}.load(path, env=...) takes any number")
             self.replay_buffer = None
         if env.num_envs != self.n_envs:
-            check_train_freq(self.train_freq, env.num_envs)
+            check_train_freq("train_freq", self.train_freq, env.num_envs)
             self.n_envs, self._last_obs, self._behaviour_state = env.num_envs, None, None
             self._fit_action_noise()
         super().set_env(env, force_reset)
@@ -87,6 +88,7 @@ class FaultTolerance(DataCollection):
         :raises ValueError: naming the observation entries whose spaces have changed since the model was saved, arguments
             that can't be changed, or the algorithm if the file is another one's
         """
+        given = present_names(cls, given, "load()")
         custom_objects = dict(custom_objects or {})
         later = {name: custom_objects.pop(name) for name in cls.restored_arguments if name in custom_objects}
         saved, _, _ = load_from_zip_file(path, device="cpu", custom_objects=custom_objects)
@@ -103,9 +105,13 @@ class FaultTolerance(DataCollection):
             env = cls._wrap_env(env, saved.get("verbose", 0))
             _check_spaces(SimpleNamespace(**saved), env, "environment")
             force_reset = force_reset or env.num_envs != saved["n_envs"]
-        attributes = {KEPT_AS.get(name, name): value for name, value in given.items()}
-        with networks_named(path, [*given, *custom_objects]):
+        former = {name: saved.pop(name) for name in merged(cls, "renamed_arguments") if name in saved}
+        present = {name: value for name, value in present_names(cls, former, None).items() if name not in saved}
+        attributes = {KEPT_AS.get(name, name): value for name, value in (present | given).items()}
+        with networks_named(path, [*given, *custom_objects]), needed_arguments_from(saved | attributes, cls):
             model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **attributes)
+        for name in former:
+            del vars(model)[name]
         model.policy.freeze_as_saved()  # type: ignore[operator]
         model._change_arguments(later)
         return model

@@ -11,20 +11,23 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
-from typing_extensions import Self
+from typing_extensions import Self, Unpack
 
-from sb3_gac.base.overrides import algorithm_of
+from sb3_gac.base.arguments import ConstructorArguments, OffPolicyArguments, present_names, with_defaults
+from sb3_gac.base.overrides import algorithm_of, check_known
 from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
 from sb3_gac.base.resuming import ResumableAlgorithm
 from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_rnn_types, resolve_role_keys
 from sb3_gac.base.strict_predict import DeploymentGuard
 from sb3_gac.checks.arguments import (
     KEPT_AS,
+    SHARED_CHECKS,
+    ArgumentCheck,
     PlainSchedule,
-    check_shared_arguments,
-    check_what_construction_needs,
+    check_arguments,
+    check_train_freq,
     make_arguments_plain,
 )
 from sb3_gac.checks.entries import check_held_by
@@ -43,13 +46,16 @@ ENT_COEF_BOUNDS = (1e-8, 1e4)
 SAMPLING_OPTIONS = ("n_steps", "gamma", "sequence_length", "burn_in")
 
 
-class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
+class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, ResumableAlgorithm):
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
 
-    A subclass names its policy class in ``policy_aliases`` and writes one gradient step.
+    A subclass names its policy class in ``policy_aliases`` and writes one gradient step. Its constructor names the arguments
+    that are its own alone, see :class:`OffPolicyArguments`: each is kept as the attribute of its name, set before
+    ``super().__init__()``, which sets everything up. ``argument_checks`` says what each may be, ``_check_arguments`` what
+    depends on others.
 
-    The arguments up to ``target_entropy``, and from ``stats_window_size`` on, are those of SB3's SAC.
+    The arguments up to ``target_entropy``, which may come by position, and from ``stats_window_size`` on, are SB3's SAC's.
 
     :param policy: "MultiInputPolicy", or a subclass of the policy class of that name
     :param env: environment with Dict observations and Box actions
@@ -88,6 +94,8 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
+    #: Argument -> what raises a ValueError unless it is allowed; a subclass writes its own, its ancestors' count as well
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = SHARED_CHECKS
     #: Arguments that files hold results of: given to ``load`` or ``resume``, they count once those are restored
     restored_arguments: ClassVar[tuple[str, ...]] = ("ent_coef", "lr_scales", "stats_window_size")
     policy_class: type[AsymmetricPolicy]
@@ -98,70 +106,30 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         self,
         policy: str | type[AsymmetricPolicy],
         env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        buffer_size: int = 1_000_000,
-        learning_starts: int = 100,
-        batch_size: int = 256,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        train_freq: int | tuple[int, str] = 1,
-        gradient_steps: int = 1,
-        action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 1,
-        ent_coef: str | float = "auto",
-        target_update_interval: int = 1,
-        target_entropy: str | float = "auto",
-        max_grad_norm: float | None = 1.0,
-        lr_scales: Mapping[str, float] | None = None,
-        role_keys: RoleKeys | None = None,
-        compile: bool = False,
-        mixed_precision: bool = False,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
-        _init_setup_model: bool = True,
+        *sb3: Any,
+        **shared: Unpack[OffPolicyArguments],
     ):
-        check_what_construction_needs(device, verbose)
+        check_known(type(self), shared)
+        arguments = with_defaults(sb3, shared)
+        for name in ("verbose", "device"):  # SB3's constructor uses them
+            SHARED_CHECKS[name](name, arguments[name])
+        sets_up = arguments.pop("_init_setup_model")
+        self.ent_coef: str | float = arguments.pop("ent_coef")
+        self.target_entropy: str | float = arguments.pop("target_entropy")
+        self.target_update_interval: int = arguments.pop("target_update_interval")
+        self.max_grad_norm: float | None = arguments.pop("max_grad_norm")
+        self.lr_scales: Mapping[str, float] | None = arguments.pop("lr_scales")
+        self.role_keys: RoleKeys | None = arguments.pop("role_keys")
+        self.compile: bool = arguments.pop("compile")
+        self.mixed_precision: bool = arguments.pop("mixed_precision")
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
-            learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            train_freq,
-            gradient_steps,
-            action_noise,
-            replay_buffer_class,
-            replay_buffer_kwargs,
-            optimize_memory_usage,
-            n_steps,
-            policy_kwargs,
-            stats_window_size,
-            tensorboard_log,
-            verbose,
-            device,
             support_multi_env=True,
-            seed=seed,
             sde_support=False,
+            **arguments,
         )
-        self.ent_coef = ent_coef
-        self.target_entropy = target_entropy
-        self.target_update_interval = target_update_interval
-        self.max_grad_norm = max_grad_norm
-        self.lr_scales = lr_scales
-        self.role_keys = role_keys
-        self.compile = compile
-        self.mixed_precision = mixed_precision
-        if _init_setup_model:
+        if sets_up:
             self._setup_model()
 
     # --- set-up -----------------------------------------------------------------------------------------------------
@@ -220,12 +188,12 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         if side_effects:
             raise ValueError("compile=True can't do dropout or batch normalisation: leave them out, or leave it False.")
         check_can_compile()
-        others = [name for name, network in self.policy.trained.items() if not network.can_be_compiled]
-        if others:
-            raise ValueError(
-                f"compile=True can do torch's Adam and AdamW without amsgrad, foreach or fused=False, but the optimiser of {others} "
-                f"is {type(self.policy.trained[others[0]].optimizer).__name__}: choose another optimizer_class, or leave it False."
-            )
+        for name, network in self.policy.trained.items():
+            if not network.can_be_compiled:
+                raise ValueError(
+                    "compile=True can do torch's Adam and AdamW, without amsgrad, foreach or fused=False, but the optimiser "
+                    f"of {name} is {type(network.optimizer).__name__}: choose another optimizer_class, or leave compile False."
+                )
 
     def _check_arguments(self) -> None:
         """
@@ -237,7 +205,10 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
         if not hasattr(self, "observation_space"):
             raise ValueError("env must be an environment, got None: load() alone can do without.")
         check_action_space(type(self).__name__, self.action_space)
-        check_shared_arguments(self)
+        check_arguments(self)
+        check_train_freq("train_freq", self.train_freq, self.n_envs)
+        if self.action_noise is not None and not isinstance(self.action_space, spaces.Box):
+            raise ValueError("action_noise can be added to Box actions only: leave it out.")
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
         assert isinstance(self.observation_space, spaces.Dict)
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
@@ -277,7 +248,7 @@ class AsymmetricOffPolicyAlgorithm(DeploymentGuard, ResumableAlgorithm):
             self.action_noise = VectorizedActionNoise(base, self.n_envs) if self.n_envs > 1 else base
 
     def _all_policy_kwargs(self) -> dict[str, Any]:
-        return {**self._policy_options(), **self.policy_kwargs}
+        return {**self._policy_options(), **present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")}
 
     def _policy_options(self) -> dict[str, Any]:
         """Arguments of the policy class that are arguments of the algorithm."""

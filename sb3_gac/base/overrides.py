@@ -2,9 +2,10 @@
 
 import difflib
 import inspect
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from sb3_gac.base.arguments import OffPolicyArguments
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.arguments import constructor_arguments, constructor_parameters
 from sb3_gac.checks.values import plain
@@ -53,17 +54,31 @@ def check_names(kind: type, given: Iterable[str], where: str) -> None:
     """
     known = [*constructor_arguments(kind), *SETTINGS]
     for name in given:
-        if name in known:
-            continue
-        policy_class: type = kind.policy_aliases.get("MultiInputPolicy", AsymmetricPolicy)  # type: ignore[attr-defined]
-        if name in constructor_parameters(policy_class):
-            hint = "It is one of policy_kwargs, which stay those that the model was made with."
-        elif name == "n_envs":
-            hint = "It follows from env."
-        else:
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f'Is "{close[0]}" meant?' if close else "Set what is no argument on the model itself."
-        raise TypeError(f'{where} got "{name}", which is no argument of {kind.__name__}. {hint}')
+        if name not in known:
+            raise _unknown(kind, name, where, known)
+
+
+def check_known(kind: type, given: Iterable[str]) -> None:
+    """
+    :param kind: an algorithm's class
+    :param given: names of arguments that no constructor of its own has taken
+    :raises TypeError: naming those that are not shared ones either, and what may be meant
+    """
+    for name in given:
+        if name not in OffPolicyArguments.__annotations__:
+            raise _unknown(kind, name, f"{kind.__name__}()", constructor_parameters(kind))
+
+
+def _unknown(kind: type, name: str, where: str, known: Sequence[str]) -> TypeError:
+    policy_class: type = kind.policy_aliases.get("MultiInputPolicy", AsymmetricPolicy)  # type: ignore[attr-defined]
+    close = difflib.get_close_matches(name, known, n=1)
+    if name in constructor_parameters(policy_class):
+        hint = "It is one of policy_kwargs."
+    elif name == "n_envs":
+        hint = "It follows from env."
+    else:
+        hint = f'Is "{close[0]}" meant?' if close else "Set what is no argument on the model itself."
+    return TypeError(f'{where} got "{name}", which is no argument of {kind.__name__}. {hint}')
 
 
 def check_unchanged(name: str, given: Any, before: Any, where: str) -> None:

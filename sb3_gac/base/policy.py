@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
+from sb3_gac.base.arguments import ConstructorArguments
 from sb3_gac.base.roles import (
     DEFAULT_NET_ARCH,
     RoleKeys,
@@ -39,7 +40,7 @@ from sb3_gac.optim.trained import TrainedParameters
 BehaviourState: TypeAlias = tuple[np.ndarray | None, ...] | None
 
 
-class AsymmetricPolicy(BoundedPolicy):
+class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
     """
     The networks of an algorithm's ``roles``, each reading the observation entries of its role, and their optimisers.
 
@@ -98,7 +99,7 @@ class AsymmetricPolicy(BoundedPolicy):
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class,  # type: ignore[arg-type]
+            features_extractor_class,
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -129,7 +130,9 @@ class AsymmetricPolicy(BoundedPolicy):
         self._role_extractors = resolve_extractors(self.roles, features_extractor_class)
         self.rnn_types = resolve_rnn_types(self.roles, rnn_type or self.default_rnn_type)
         seen = {key for role in self.roles.policies for key in self.role_keys[role]}
-        self._acting_reader = ObservationReader(role_space(observation_space, [key for key in observation_space if key in seen]))
+        self._acting_reader = ObservationReader(
+            role_space(observation_space, [key for key in observation_space if key in seen])
+        )
         self._build_networks()
         self._build_optimizers(lr_schedule)
 
@@ -144,7 +147,7 @@ class AsymmetricPolicy(BoundedPolicy):
         :param role: deployed policy or another one
         :param arguments: of its network
         """
-        return (Actor if role == self.roles.deployed else RolePolicy)(**arguments)
+        return Actor(**arguments)
 
     def has(self, role: str) -> bool:
         """Whether there is a network for the role, which an ablation may do without."""
@@ -168,8 +171,8 @@ class AsymmetricPolicy(BoundedPolicy):
                 self._set_target(role, ensemble(**self._role_kwargs(role, deepcopy(shared)), n_critics=self.n_critics))
 
         pairs = self.pairs.values()
-        self._followed = [parameter for network, _ in pairs for parameter in network.parameters()]
-        self._following = [parameter for _, target in pairs for parameter in target.parameters()]
+        self._followed: list[th.Tensor] = [parameter for network, _ in pairs for parameter in network.parameters()]
+        self._following: list[th.Tensor] = [parameter for _, target in pairs for parameter in target.parameters()]
         self._has_statistics = any(get_parameters_by_name(network, ["running_"]) for network, _ in pairs)
 
     @property
@@ -248,7 +251,9 @@ class AsymmetricPolicy(BoundedPolicy):
         if optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
             kwargs.setdefault("fused", True)
         lr_scales = resolve_lr_scales(self.roles, self.constructor_options["lr_scales"])
-        of_deployed = {id(parameter) for parameter in self.deployed.parameters()}  # with a shared encoder, whoever else holds it
+        of_deployed = {
+            id(parameter) for parameter in self.deployed.parameters()
+        }  # with a shared encoder, whoever else holds it
         self.trained: dict[str, TrainedParameters] = {}
         for role in (role for role in self.roles.all if getattr(self, role) is not None):
             network = getattr(self, role)

@@ -17,6 +17,7 @@ from stable_baselines3.common.save_util import recursive_getattr, recursive_seta
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
 from typing_extensions import Self
 
+from sb3_gac.base.arguments import present_names
 from sb3_gac.base.faults import networks_named
 from sb3_gac.base.overrides import SETTINGS, check_names, check_unchanged
 from sb3_gac.base.update import NetworkTraining
@@ -216,10 +217,11 @@ class ResumableAlgorithm(NetworkTraining):
             raise CheckpointError(f"{path} is of {state['algorithm']}: resume it with that class, not {cls.__name__}.")
         with np.load(io.BytesIO(files[_ARRAYS]), allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
+        given = present_names(cls, given, "resume()")
         check_names(cls, given, "resume()")
         settings = {name: given.pop(name) for name in SETTINGS if name in given}
         later = {name: given.pop(name) for name in cls.restored_arguments if name in given}
-        before = _decoded_arguments(state["arguments"], given, arrays)
+        before = _decoded_arguments(present_names(cls, state["arguments"], None), given, arrays)
         model = cls(env=env, device=device, **before | given)
         model._check_same_spaces(state)
         model._check_fixed_arguments(given, before)

@@ -58,7 +58,7 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         (actor,) = self.outputs(batch, "actor")
         metrics = self.minimize("critic", self.sac_critic_loss, batch, actor, noise[0], beta)
         metrics |= self.minimize("actor", self.actor_loss, batch, actor, noise[1], beta)
-        metrics |= self.ent_coef_dual.update(self.target_entropy - metrics["entropy"])
+        metrics |= self.ent_coef_dual.update(float(self.target_entropy) - metrics["entropy"])
         return metrics | self.coefficient_values()
 
     def sac_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:

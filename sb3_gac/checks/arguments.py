@@ -1,12 +1,12 @@
-"""Checks of the constructor arguments that all our off-policy algorithms have; see :mod:`sb3_gac.checks.values`."""
+"""Checks of constructor arguments, one table for each class; see :mod:`sb3_gac.checks.values`."""
 
 import inspect
 import os
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, TypeAlias
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -24,8 +24,10 @@ from sb3_gac.checks.values import (
     plain,
 )
 
+ArgumentCheck: TypeAlias = Callable[..., None]
+"""Takes an argument's name and its value; raises a ValueError that says what is allowed."""
+
 LARGEST_SEED = 2**32 - 1
-SWITCHES = ("optimize_memory_usage", "compile", "mixed_precision")
 #: Argument -> SB3's attribute, where it is called otherwise
 KEPT_AS = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
 #: What is handed on to classes that may be the user's own, with all arrays that they may take
@@ -79,79 +81,119 @@ def make_arguments_plain(model: OffPolicyAlgorithm) -> None:
             vars(model)[name] = plain(vars(model)[name], arrays=argument not in HANDED_ON)
 
 
-def check_what_construction_needs(device: Any, verbose: Any) -> None:
+def merged(kind: type, table: str) -> dict[str, Any]:
     """
-    What SB3's constructor uses before :func:`check_shared_arguments` can look at it.
-
-    :raises ValueError: unless torch has such a device, and ``verbose`` is a number
+    :param kind: a class
+    :param table: name of a mapping that it and its ancestors may have, each with entries of its own
+    :return: all entries, a class's over those of its ancestors
     """
-    check_integer("verbose", verbose, 0)
-    try:
-        th.device("cpu" if device == "auto" else device)
-    except (RuntimeError, TypeError):
-        raise ValueError(f'device must be "auto", "cpu", "cuda" or another of torch\'s, got {device!r}.') from None
+    return {name: entry for ancestor in reversed(kind.__mro__) for name, entry in vars(ancestor).get(table, {}).items()}
 
 
-def check_shared_arguments(model: OffPolicyAlgorithm) -> None:
+def check_arguments(model: Any) -> None:
     """
-    Those that are checked nowhere else: roles, heads and coefficients check their own.
+    Each by the entry that ``argument_checks`` has for it.
 
     :param model: whose attributes are the arguments, as they were given or as they were saved
     :raises ValueError: naming the argument, what is allowed and what it was
+    :raises AttributeError: naming the argument that is not there yet
     """
-    values = vars(model)
-    check_schedule("learning_rate", model.learning_rate, may_be_zero=True)  # so rl_zoo3 loads models to play with
-    check_integer("buffer_size", model.buffer_size, 1)
-    check_not_negative("learning_starts", model.learning_starts)
-    check_integer("batch_size", model.batch_size, 1)
-    check_fraction("tau", model.tau)
-    check_fraction("gamma", model.gamma)
-    check_train_freq(model.train_freq, model.n_envs)
-    check_integer("gradient_steps", model.gradient_steps, -1, remedy="-1 for as many as environment steps")
-    check_integer("n_steps", model.n_steps, 1)
-    check_integer("target_update_interval", values["target_update_interval"], 1)
-    check_integer("stats_window_size", model._stats_window_size, 1)
-    if model.seed is not None:
-        check_integer("seed", model.seed, 0, LARGEST_SEED, remedy="or None")
-    if values["max_grad_norm"] is not None:
-        check_positive("max_grad_norm", values["max_grad_norm"], remedy="or None for no clipping")
-    for name in SWITCHES:
-        check_choice(name, values[name], (False, True))
-    _check_replay_and_noise(model)
-    for name in ("policy_kwargs", "replay_buffer_kwargs"):
-        check_type(name, values[name], Mapping, "a dict or None")
-    for name in ("lr_scales", "role_keys"):
-        check_type(name, values[name], (Mapping, type(None)), "a dict of networks or None")
-    check_type("tensorboard_log", model.tensorboard_log, (str, os.PathLike, type(None)), "a directory or None")
+    for argument, check in merged(type(model), "argument_checks").items():
+        name = KEPT_AS.get(argument, argument)
+        if not hasattr(model, name):
+            raise AttributeError(
+                f"{type(model).__name__} has no attribute {name!r} to check: its constructor is to set it before it calls "
+                "super().__init__(), which sets everything up."
+            )
+        check(argument, getattr(model, name))
 
 
-def check_train_freq(train_freq: Any, n_envs: int) -> None:
+def unless(other: Any, check: ArgumentCheck, **options: Any) -> ArgumentCheck:
     """
-    :param train_freq: as given, or as SB3 converts it
+    :param other: what may be given instead of what ``check`` allows
+    :param check: of all else
+    :param options: of ``check``
+    """
+
+    def checked(name: str, value: Any) -> None:
+        if not (value is other or (isinstance(value, str) and value == other)):
+            check(name, value, **options)
+
+    return checked
+
+
+def check_switch(name: str, value: Any) -> None:
+    """
+    :raises ValueError: unless it is true or false
+    """
+    check_choice(name, value, (False, True))
+
+
+def check_device(name: str, value: Any) -> None:
+    """
+    :raises ValueError: unless torch has such a device
+    """
+    try:
+        th.device("cpu" if value == "auto" else value)
+    except (RuntimeError, TypeError):
+        raise ValueError(f'{name} must be "auto", "cpu", "cuda" or another of torch\'s, got {value!r}.') from None
+
+
+def check_train_freq(name: str, value: Any, n_envs: int = 1) -> None:
+    """
+    :param name: of the argument
+    :param value: as given, or as SB3 converts it
     :param n_envs: number of environments
     :raises ValueError: unless it is a number of steps, or (number, "step" | "episode")
     """
-    allowed = 'train_freq must be an integer >= 1 or (integer >= 1, "step" or "episode")'
-    pair = train_freq if isinstance(train_freq, tuple) else (train_freq, "step")
+    allowed = f'{name} must be an integer >= 1 or (integer >= 1, "step" or "episode")'
+    pair = value if isinstance(value, tuple) else (value, "step")
     frequency, unit = pair if len(pair) == 2 else (None, None)
     if not isinstance(frequency, int) or frequency < 1 or unit not in {"step", "episode", *TrainFrequencyUnit}:
-        raise ValueError(f"{allowed}, got {train_freq!r}.")
+        raise ValueError(f"{allowed}, got {value!r}.")
     if unit in ("episode", TrainFrequencyUnit.EPISODE) and n_envs > 1:
-        raise ValueError(f"{allowed}; episodes can be counted in one environment only, got {train_freq!r} for {n_envs}.")
+        raise ValueError(f"{allowed}; episodes can be counted in one environment only, got {value!r} for {n_envs}.")
 
 
-def _check_replay_and_noise(model: OffPolicyAlgorithm) -> None:
-    if model.action_noise is not None:
-        check_type("action_noise", model.action_noise, ActionNoise, "an ActionNoise or None")
-        if not isinstance(model.action_space, spaces.Box):
-            raise ValueError("action_noise can be added to Box actions only: leave it out.")
-    buffer_class = model.replay_buffer_class
-    if buffer_class is None:
+def check_replay_buffer_class(name: str, value: Any) -> None:
+    """
+    :raises ValueError: unless it is a class of buffers that hold Dict observations, or ``None``
+    """
+    if value is None:
         return
-    if not (isinstance(buffer_class, type) and issubclass(buffer_class, ReplayBuffer)):
-        raise ValueError(f"replay_buffer_class must be DictReplayBuffer, a subclass of it or None, got {buffer_class!r}.")
-    if buffer_class in (ReplayBuffer, NStepReplayBuffer):
+    if not (isinstance(value, type) and issubclass(value, ReplayBuffer)):
+        raise ValueError(f"{name} must be DictReplayBuffer, a subclass of it or None, got {value!r}.")
+    if value in (ReplayBuffer, NStepReplayBuffer):
         raise ValueError(
-            f"replay_buffer_class={buffer_class.__name__} can't hold Dict observations: "
-            "leave it out, or give DictReplayBuffer or a subclass."
+            f"{name}={value.__name__} can't hold Dict observations: leave it out, or give DictReplayBuffer or a subclass."
         )
+
+
+#: Of the shared arguments; roles, heads and coefficients check their own, and what depends on others is checked with them
+SHARED_CHECKS: Mapping[str, ArgumentCheck] = {
+    "learning_rate": partial(check_schedule, may_be_zero=True),  # so rl_zoo3 loads models to play with
+    "buffer_size": partial(check_integer, low=1),
+    "learning_starts": check_not_negative,
+    "batch_size": partial(check_integer, low=1),
+    "tau": check_fraction,
+    "gamma": check_fraction,
+    "train_freq": check_train_freq,
+    "gradient_steps": partial(check_integer, low=-1, remedy="-1 for as many as environment steps"),
+    "action_noise": partial(check_type, types=(ActionNoise, type(None)), expected="an ActionNoise or None"),
+    "replay_buffer_class": check_replay_buffer_class,
+    "replay_buffer_kwargs": partial(check_type, types=Mapping, expected="a dict or None"),
+    "optimize_memory_usage": check_switch,
+    "n_steps": partial(check_integer, low=1),
+    "target_update_interval": partial(check_integer, low=1),
+    "max_grad_norm": unless(None, check_positive, remedy="or None for no clipping"),
+    "lr_scales": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
+    "role_keys": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
+    "compile": check_switch,
+    "mixed_precision": check_switch,
+    "stats_window_size": partial(check_integer, low=1),
+    "tensorboard_log": partial(check_type, types=(str, os.PathLike, type(None)), expected="a directory or None"),
+    "policy_kwargs": partial(check_type, types=Mapping, expected="a dict or None"),
+    "verbose": partial(check_integer, low=0),
+    "seed": unless(None, check_integer, low=0, high=LARGEST_SEED, remedy="or None"),
+    "device": check_device,
+}

@@ -1,22 +1,23 @@
 """Guided Actor-Critic."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from typing_extensions import Unpack
 
-from sb3_gac.base.roles import RoleKeys
-from sb3_gac.checks.arguments import PlainSchedule
+from sb3_gac.base.arguments import OffPolicyArguments
+from sb3_gac.base.policy import BehaviourState
+from sb3_gac.checks.arguments import ArgumentCheck, PlainSchedule, check_switch, unless
 from sb3_gac.checks.entries import check_is_observation
 from sb3_gac.checks.values import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.gac.actors import GUIDERS
-from sb3_gac.gac.policies import STD_OF, GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
+from sb3_gac.gac.policies import SHARED_STDS, GACGruPolicy, GACLstmPolicy, GACPolicy, MultiInputPolicy
 from sb3_gac.gac.update import GuidedUpdate
 from sb3_gac.math.distributions import KL_REDUCTIONS
 from sb3_gac.optim.coefficients import Coefficient, make_coefficient
@@ -38,7 +39,7 @@ class GAC(GuidedUpdate):
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
     :param guider: "residual": learner plus a privileged correction; "independent": a network of its own (the paper's)
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
-    :param std_of: whose standard deviation both policies have, "learner" or "guider"; the other borrows it as a constant.
+    :param shared_std: whose standard deviation both policies have, "learner" or "guider"; the other borrows it as a constant.
         "auto" is the guider's, the paper's, unless the guider is residual and the learner has an entropy term
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
         is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
@@ -53,28 +54,24 @@ class GAC(GuidedUpdate):
         "MultiInputLstmPolicy": GACLstmPolicy,
     }
 
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {
+        "target_kl": partial(check_schedule, remedy="for example the default 0.0033, or a schedule of such"),
+        "kl_coef_learning_rate": check_positive,
+        "kl_reduction": partial(check_choice, choices=KL_REDUCTIONS),
+        "guider": partial(check_choice, choices=GUIDERS),
+        "max_kl": unless(None, check_positive, remedy="or None for no hard bound"),
+        "shared_std": partial(check_choice, choices=("auto", *SHARED_STDS)),
+        "learner_kl_scale": unless("auto", check_not_negative, remedy='or "auto"'),
+        "learner_entropy": check_switch,
+    }
+    renamed_arguments: ClassVar[Mapping[str, str]] = {"std_of": "shared_std"}
     restored_arguments = (*GuidedUpdate.restored_arguments, "kl_coef", "kl_coef_bounds", "kl_coef_learning_rate")
 
     def __init__(
         self,
         policy: str | type[GACPolicy],
         env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        buffer_size: int = 1_000_000,
-        learning_starts: int = 100,
-        batch_size: int = 256,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        train_freq: int | tuple[int, str] = 1,
-        gradient_steps: int = 1,
-        action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 1,
-        ent_coef: str | float = "auto",
-        target_update_interval: int = 1,
-        target_entropy: str | float = "auto",
+        *sb3: Any,
         target_kl: float | Schedule = 0.0033,
         kl_coef: str | float = "auto",
         kl_coef_bounds: tuple[float, float] = (1e-4, 100.0),
@@ -82,54 +79,11 @@ class GAC(GuidedUpdate):
         kl_reduction: str = "mean",
         guider: str = "residual",
         max_kl: float | None = None,
-        std_of: str = "auto",
+        shared_std: str = "auto",
         learner_kl_scale: str | float = "auto",
         learner_entropy: bool = True,
-        max_grad_norm: float | None = 1.0,
-        lr_scales: Mapping[str, float] | None = None,
-        role_keys: RoleKeys | None = None,
-        compile: bool = False,
-        mixed_precision: bool = False,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
-        _init_setup_model: bool = True,
+        **shared: Unpack[OffPolicyArguments],
     ):
-        super().__init__(
-            policy,
-            env,
-            learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            train_freq,
-            gradient_steps,
-            action_noise,
-            replay_buffer_class,
-            replay_buffer_kwargs,
-            optimize_memory_usage,
-            n_steps,
-            ent_coef,
-            target_update_interval,
-            target_entropy,
-            max_grad_norm,
-            lr_scales,
-            role_keys,
-            compile,
-            mixed_precision,
-            stats_window_size,
-            tensorboard_log,
-            policy_kwargs,
-            verbose,
-            seed,
-            device,
-            _init_setup_model=False,
-        )
         self.target_kl = target_kl
         self.kl_coef = kl_coef
         self.kl_coef_bounds = kl_coef_bounds
@@ -137,33 +91,22 @@ class GAC(GuidedUpdate):
         self.kl_reduction = kl_reduction
         self.guider = guider
         self.max_kl = max_kl
-        self.std_of = std_of
+        self.shared_std = shared_std
         self.learner_kl_scale = learner_kl_scale
         self.learner_entropy = learner_entropy
-        if _init_setup_model:
-            self._setup_model()
+        super().__init__(policy, env, *sb3, **shared)
 
     # --- set-up -----------------------------------------------------------------------------------------------------
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_schedule("target_kl", self.target_kl, remedy="for example the default 0.0033, or a schedule of such")
-        check_positive("kl_coef_learning_rate", self.kl_coef_learning_rate)
-        check_choice("kl_reduction", self.kl_reduction, KL_REDUCTIONS)
-        check_choice("learner_entropy", self.learner_entropy, (False, True))
-        check_choice("guider", self.guider, GUIDERS)
-        check_choice("std_of", self.std_of, ("auto", *STD_OF))
-        if self.std_of == "learner" and not self._learner_can_train_a_std():
+        if self.shared_std == "learner" and not self._learner_can_train_a_std():
             raise ValueError(
-                'std_of="learner" needs an entropy term in the learner\'s objective, or nothing keeps its std from falling: '
-                'leave std_of "auto", or give GAC or GACShare learner_entropy=True.'
+                'shared_std="learner" needs an entropy term in the learner\'s objective, or nothing keeps its std from '
+                'falling: leave shared_std "auto", or give GAC or GACShare learner_entropy=True.'
             )
-        if self.max_kl is not None:
-            check_positive("max_kl", self.max_kl, remedy="or None for no hard bound")
-            if not isinstance(self.action_space, spaces.Box):
-                raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
-        if self.learner_kl_scale != "auto":
-            check_not_negative("learner_kl_scale", self.learner_kl_scale, remedy='or "auto"')
+        if self.max_kl is not None and not isinstance(self.action_space, spaces.Box):
+            raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
 
     def _learner_can_train_a_std(self) -> bool:
         return self.learner_entropy
@@ -174,7 +117,7 @@ class GAC(GuidedUpdate):
             "guider": self.guider,
             "max_kl": self.max_kl,
             "kl_reduction": self.kl_reduction,
-            "std_of": self.std_of if self.std_of != "auto" else ("learner" if own else "guider"),
+            "shared_std": self.shared_std if self.shared_std != "auto" else ("learner" if own else "guider"),
         }
 
     def make_coefficients(self) -> dict[str, Coefficient]:
@@ -191,10 +134,10 @@ class GAC(GuidedUpdate):
     def predict_guider(
         self,
         observation: dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
+        state: BehaviourState = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    ) -> tuple[np.ndarray, BehaviourState]:
         """
         The guider's action; needs the full observation. Arguments and result are those of ``predict``.
 
@@ -209,6 +152,6 @@ class GAC(GuidedUpdate):
         self.policy.check_seen_by("guider", observation, "predict_guider()")
         self.policy.set_training_mode(False)
         _, vectorized = self.policy.obs_to_tensor(observation)
-        scaled_action, state = self.policy.behaviour_action(observation, state, episode_start, deterministic)
+        scaled_action, after = self.policy.behaviour_action(observation, state, episode_start, deterministic)
         action = self._in_environments_range(scaled_action)
-        return (action if vectorized else action.squeeze(axis=0)), state
+        return (action if vectorized else action.squeeze(axis=0)), after

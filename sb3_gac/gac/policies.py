@@ -1,7 +1,7 @@
 """Guider, learner and four critics: the networks of Guided Actor-Critic for Box and Discrete actions."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -14,7 +14,7 @@ from sb3_gac.math.distributions import Distribution
 from sb3_gac.networks.actors import RolePolicy
 from sb3_gac.networks.critics import CriticEnsemble
 
-STD_OF = ("learner", "guider")
+SHARED_STDS = ("learner", "guider")
 
 
 class ActionDistributions(NamedTuple):
@@ -43,13 +43,14 @@ class GACPolicy(AsymmetricPolicy):
     :param max_kl: hard bound on KL(guider || learner), or ``None``
     :param kl_reduction: how that KL is reduced over action dimensions, "mean" or "sum"
     :param learner_critics: whether the learner has critics of its own
-    :param std_of: whose std both Gaussians have, one of ``STD_OF``; what the other's network says of its own counts at most
-        at deployment
+    :param shared_std: whose std both Gaussians have, one of ``SHARED_STDS``; what the other's network says of its own counts
+        at most at deployment
     """
 
     learner_critic: CriticEnsemble | None
     learner_critic_target: CriticEnsemble | None
 
+    renamed_arguments: ClassVar[Mapping[str, str]] = {"std_of": "shared_std"}
     guider: Guider
     learner: Learner
     guider_critic: CriticEnsemble
@@ -68,14 +69,14 @@ class GACPolicy(AsymmetricPolicy):
         max_kl: float | None = None,
         kl_reduction: str = "mean",
         learner_critics: bool = True,
-        std_of: str = "learner",
+        shared_std: str = "learner",
         **kwargs: Any,
     ):
         self.guider_class = GUIDERS[guider]
         self.learner_critics = learner_critics
-        self.owns_std = std_of == "learner"
-        self.guider_options = {"max_kl": max_kl, "kl_reduction": kl_reduction}
-        self.own = {"guider": guider, "learner_critics": learner_critics, "std_of": std_of, **self.guider_options}
+        self.owns_std = shared_std == "learner"
+        self.guider_options: dict[str, Any] = {"max_kl": max_kl, "kl_reduction": kl_reduction}
+        self.own = {"guider": guider, "learner_critics": learner_critics, "shared_std": shared_std, **self.guider_options}
         super().__init__(observation_space, action_space, lr_schedule, net_arch, activation_fn, **kwargs)
 
     def own_options(self) -> dict[str, Any]:

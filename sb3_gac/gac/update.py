@@ -14,9 +14,9 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     """
     Guider and learner each fit their critics (eqs. 12, 15) and then climb them (eqs. 13, 16); then beta and alpha follow.
 
-    In all losses ``guider`` and ``learner`` are what the two networks computed for the batch before anything was changed, alpha
-    is the KL's coefficient, beta the entropy's, and ``noise`` is standard normal, of the actions' shape. The attributes below
-    are set by :class:`sb3_gac.GAC`, where they are described.
+    In all losses ``guider`` and ``learner`` are what the two networks computed for the batch before anything was changed,
+    alpha is the KL's coefficient, beta the entropy's, and ``noise`` is standard normal, of the actions' shape. The attributes
+    below are set by :class:`sb3_gac.GAC`, where they are described.
     """
 
     compiled_settings = (
@@ -51,7 +51,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
                 Step("learner", self.learner_loss, (batch, *pi, noise[3], alpha, beta)),  # eq. 16
             ],
         )
-        metrics |= self.ent_coef_dual.update(self.target_entropy - metrics["entropy"])
+        metrics |= self.ent_coef_dual.update(float(self.target_entropy) - metrics["entropy"])
         metrics |= self.kl_coef_dual.update(metrics["kl"] - self.target_kl_tensor)  # eq. 17
         return metrics | self.coefficient_values() | {"kl_coef_on_bound": self.kl_coef_dual.at_bound()}
 
@@ -89,9 +89,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
 
     # --- the learner ------------------------------------------------------------------------------------------------
 
-    def learner_critic_loss(
-        self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, beta: th.Tensor
-    ) -> Loss:
+    def learner_critic_loss(self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """Eq. 15: the learner's own return."""
         with th.no_grad():
             policy = self.policy.combine(guider.later, learner.later).learner

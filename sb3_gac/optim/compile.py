@@ -23,7 +23,9 @@ def check_can_compile() -> None:
     import torch._dynamo.config  # slow to import
 
     if not hasattr(torch._dynamo.config, "trace_autograd_ops") or not hasattr(th.compiler, "skip_all_guards_unsafe"):
-        raise ValueError(f"compile=True needs torch 2.13 or later, and this is {th.__version__}: update it, or leave it False.")
+        raise ValueError(
+            f"compile=True needs torch 2.13 or later, and this is {th.__version__}: update it, or leave it False."
+        )
 
 
 class Program:
@@ -39,7 +41,7 @@ class Program:
     """
 
     def __init__(self, function: Callable[..., Any], device: th.device):
-        options = {
+        options: dict[str, Any] = {
             **_OPTIONS.get(device.type, {}),
             "fallback_random": True,  # the random numbers of the plain function
             "guard_filter_fn": th.compiler.skip_all_guards_unsafe,

@@ -77,13 +77,15 @@ class TrainedParameters:
                 state["step"] = th.zeros((), device=parameter.device)
                 state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(parameter), th.zeros_like(parameter)
         states = [self.optimizer.state[parameter] for parameter in self.parameters]
-        of_each = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
+        means, squares, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
         learning_rate = th.zeros((), device=self.everything[0].device if self.everything else None)
-        return AdamTensors(list(self.parameters), *of_each, learning_rate)
+        return AdamTensors(list(self.parameters), means, squares, steps, learning_rate)
 
     def freeze_as_saved(self) -> None:
         """Freeze and unfreeze the parameters as they were when the optimiser's state was saved."""
-        for parameter, trained in zip(self.everything, self.optimizer.param_groups[0].get("trained", self.trained), strict=True):
+        for parameter, trained in zip(
+            self.everything, self.optimizer.param_groups[0].get("trained", self.trained), strict=True
+        ):
             parameter.requires_grad_(trained)
 
     def step(self, gradients: Sequence[th.Tensor], max_norm: float | None) -> th.Tensor:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from sb3_gac.optim.flat import FlatAdam, TrainedParameters
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
-from sb3_gac.optim.flat import FlatAdam, TrainedParameters
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
 
 ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
@@ -89,9 +89,9 @@ def test_a_whole_network_frozen_after_construction_stays_and_the_others_train(cl
 
 
 @pytest.mark.parametrize("part", ["head.mean", "head.log_std", "latent_net"])
-@pytest.mark.parametrize("std_of", ["learner", "guider"])
-def test_parts_of_the_learner(part, std_of):
-    model = small_model(std_of=std_of, learning_rate=1e-2).learn(15)
+@pytest.mark.parametrize("shared_std", ["learner", "guider"])
+def test_parts_of_the_learner(part, shared_std):
+    model = small_model(shared_std=shared_std, learning_rate=1e-2).learn(15)
     parts = {name: model.policy.learner.get_submodule(name) for name in ("head.mean", "head.log_std", "latent_net")}
     parts[part].requires_grad_(False)
     before = {name: _parameters(module) for name, module in parts.items()}

@@ -8,6 +8,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_gac import GAC, AsymmetricSAC
+from sb3_gac.checks.arguments import HANDED_ON, merged, unless
+from sb3_gac.checks.values import check_fraction, check_positive
 from tests.helpers import TwoViewBandit, small_model
 
 NAN, INF = float("nan"), float("inf")
@@ -82,7 +84,7 @@ GACS_OWN = {
     "kl_coef_learning_rate": ([0, -1, NAN, "fast", None], "kl_coef_learning_rate must be a number > 0"),
     "kl_reduction": (["max", None, 3], r"kl_reduction must be one of \['mean', 'sum'\]"),
     "guider": (["teacher", None, []], r"guider must be one of \['independent', 'residual'\]"),
-    "std_of": (["nobody", None, 1], r"std_of must be one of \['auto', 'guider', 'learner'\]"),
+    "shared_std": (["nobody", None, 1], r"shared_std must be one of \['auto', 'guider', 'learner'\]"),
     "max_kl": ([0, -1, NAN, INF, "tight"], "max_kl must be a number > 0, or None"),
     "learner_kl_scale": ([-1, NAN, INF, "full", None], 'learner_kl_scale must be a number >= 0, or "auto"'),
     "learner_entropy": (["yes", 2, None], r"learner_entropy must be one of \[False, True\]"),
@@ -109,6 +111,45 @@ def test_an_argument_out_of_its_range_is_named(cls, name, value, message):
 def test_no_argument_is_forgotten(cls):
     parameters = set(inspect.signature(cls).parameters) - {"_init_setup_model"}  # SB3's, for load()
     assert parameters == set(ARGUMENTS[cls])
+
+
+#: Checked where they are used, with what they depend on: by the set-up, or by what is made of them
+NOT_IN_TABLES = {"policy", "env", "ent_coef", "target_entropy", "kl_coef", "kl_coef_bounds"}
+
+
+@pytest.mark.parametrize("cls", ARGUMENTS)
+def test_every_argument_has_a_check_in_the_tables_or_needs_none_there(cls):
+    checks = merged(cls, "argument_checks")
+    assert set(checks) == set(ARGUMENTS[cls]) - NOT_IN_TABLES
+    defaults = {name: parameter.default for name, parameter in inspect.signature(cls).parameters.items()}
+    for name, check in checks.items():
+        check(name, {} if name in HANDED_ON else defaults[name])
+
+
+class _WithOneMore(AsymmetricSAC):
+    argument_checks = {"weight": check_positive, "tau": unless("slow", check_fraction)}  # noqa: RUF012
+
+    def __init__(self, *args, weight=1.0, **shared):
+        self.weight = weight
+        super().__init__(*args, **shared)
+
+
+def test_a_subclass_adds_to_the_table_and_may_replace_entries():
+    assert small_model(cls=_WithOneMore, tau="slow").tau == "slow"
+    for name, value in {"weight": 0, "tau": "fast", "gamma": 2}.items():
+        with pytest.raises(ValueError, match=f"^{name} must be a number .*, got {value!r}"):
+            small_model(cls=_WithOneMore, **{name: value})
+
+
+class _SetTooLate(_WithOneMore):
+    def __init__(self, *args, **shared):
+        AsymmetricSAC.__init__(self, *args, **shared)
+        self.weight = 1.0
+
+
+def test_an_argument_that_is_kept_too_late_is_named():
+    with pytest.raises(AttributeError, match=r"no attribute 'weight' to check: .* before it calls super\(\).__init__\(\)"):
+        small_model(cls=_SetTooLate)
 
 
 @pytest.mark.parametrize("cls", ARGUMENTS)

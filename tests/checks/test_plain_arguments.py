@@ -138,7 +138,7 @@ def test_a_model_made_with_foreign_numbers_is_saved_loaded_and_resumed(cls, tmp_
 
 def test_every_argument_that_can_hold_a_number_is_tried():
     others = {"policy", "env", "action_noise", "replay_buffer_class", "role_keys", "kl_coef", "kl_reduction", "guider"}
-    others |= {"std_of", "tensorboard_log", "device", "_init_setup_model"}
+    others |= {"shared_std", "tensorboard_log", "device", "_init_setup_model"}
     assert set(inspect.signature(GAC).parameters) == {*SHARED, *GACS_OWN, *others}
 
 

@@ -28,12 +28,12 @@ def test_residual_guider_starts_at_the_learner_and_its_kl_is_half_its_squared_ou
     assert guider.kl_of_means(learner).mean() < 1e-3
 
 
-@pytest.mark.parametrize("std_of", ["learner", "guider"])
+@pytest.mark.parametrize("shared_std", ["learner", "guider"])
 @pytest.mark.parametrize("guider", ["residual", "independent"])
 @pytest.mark.parametrize("kl_reduction", ["mean", "sum"])
-def test_max_kl_bounds_the_kl_of_every_state(guider, kl_reduction, std_of):
+def test_max_kl_bounds_the_kl_of_every_state(guider, kl_reduction, shared_std):
     """Of four action dimensions; KL by hand."""
-    model = small_model(Recorded(n_actions=4), guider=guider, max_kl=0.01, kl_reduction=kl_reduction, std_of=std_of)
+    model = small_model(Recorded(n_actions=4), guider=guider, max_kl=0.01, kl_reduction=kl_reduction, shared_std=shared_std)
     unlike_each_other(model.policy)
     obs = {"partial": th.randn(64, 3), "privileged": th.randn(64, 2)}
     with th.no_grad():
@@ -58,9 +58,9 @@ def test_the_guider_collects_and_the_learner_is_evaluated():
     assert scaled[0, 0] == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize(("std_of", "more"), [("learner", set()), ("guider", {"log_std_loss"})])
-def test_everything_is_logged(std_of, more):
-    model = small_model(std_of=std_of)
+@pytest.mark.parametrize(("shared_std", "more"), [("learner", set()), ("guider", {"log_std_loss"})])
+def test_everything_is_logged(shared_std, more):
+    model = small_model(shared_std=shared_std)
     model.learn(30)
     logged = {name.removeprefix("train/") for name in model.logger.name_to_value if name.startswith("train/")}
     assert logged >= LOGGED | more
@@ -190,22 +190,22 @@ def test_time_limits_bootstrap_and_terminations_do_not(truncate):
         (GAC, {}, "learner"),
         (GAC, {"learner_entropy": False}, "guider"),
         (GAC, {"guider": "independent"}, "guider"),
-        (GAC, {"guider": "independent", "std_of": "learner"}, "learner"),
-        (GAC, {"std_of": "guider"}, "guider"),
+        (GAC, {"guider": "independent", "shared_std": "learner"}, "learner"),
+        (GAC, {"shared_std": "guider"}, "guider"),
         (GACShare, {}, "learner"),
         (GACWithoutQ, {}, "guider"),
     ],
 )
 def test_whose_std_both_policies_have(cls, arguments, owner):
     policy = small_model(cls=cls, **arguments).policy
-    assert policy.constructor_options["std_of"] == owner
+    assert policy.constructor_options["shared_std"] == owner
     assert policy.learner.owns_std == (owner == "learner")
 
 
 @pytest.mark.parametrize(("cls", "arguments"), [(GAC, {"learner_entropy": False}), (GACWithoutQ, {})])
 def test_a_learner_without_an_entropy_term_cannot_train_a_std(cls, arguments):
-    with pytest.raises(ValueError, match='std_of="learner" needs an entropy term'):
-        small_model(cls=cls, std_of="learner", **arguments)
+    with pytest.raises(ValueError, match='shared_std="learner" needs an entropy term'):
+        small_model(cls=cls, shared_std="learner", **arguments)
 
 
 def test_the_learners_update_is_that_of_sac_with_asymmetric_critics(monkeypatch):

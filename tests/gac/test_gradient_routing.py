@@ -36,8 +36,8 @@ FORMS = [("residual", "learner"), ("residual", "guider"), ("independent", "learn
 
 @pytest.fixture(params=FORMS, ids="-".join)
 def model(request):
-    guider, std_of = request.param
-    return small_model(guider=guider, std_of=std_of)
+    guider, shared_std = request.param
+    return small_model(guider=guider, shared_std=shared_std)
 
 
 def test_guider_loss_moves_the_guider_alone(model):
@@ -50,9 +50,9 @@ def test_guider_loss_moves_the_guider_alone(model):
     }
 
 
-@pytest.mark.parametrize(("guider", "std_of"), FORMS)
-def test_a_bound_on_kl_moves_neither_the_learner_nor_a_borrowed_std(guider, std_of):
-    model = small_model(guider=guider, std_of=std_of, max_kl=0.01)
+@pytest.mark.parametrize(("guider", "shared_std"), FORMS)
+def test_a_bound_on_kl_moves_neither_the_learner_nor_a_borrowed_std(guider, shared_std):
+    model = small_model(guider=guider, shared_std=shared_std, max_kl=0.01)
     unlike_each_other(model.policy)
     distributions = model.policy.distributions(_observations())
     assert _reached(model.policy, distributions.guider.mean.sum()) == {"guider"}
@@ -69,7 +69,7 @@ def test_learner_q_term_has_a_gradient_for_the_mean_and_for_the_std_unless_it_is
     obs = _observations()
     _, learner, _ = model.policy.distributions(obs)
     q = model.policy.learner_critic(obs, learner.sample())
-    own = {"learner_log_std"} if model.std_of == "learner" else set()
+    own = {"learner_log_std"} if model.shared_std == "learner" else set()
     assert _reached(model.policy, policy_loss(q=q, kl=th.zeros(8), kl_coef=1.0)) == {"learner", "learner_critic"} | own
 
 
@@ -79,19 +79,19 @@ def test_guider_q_term_has_a_gradient_for_the_mean_and_for_the_std_unless_it_is_
     q = model.policy.guider_critic(obs, guider.sample())
     assert _reached(model.policy, -q.mean()) == {"guider", "guider_critic"}
     reaches_std = model.policy.guider.head.log_std.weight.grad is not None
-    assert reaches_std == (model.std_of == "guider")
+    assert reaches_std == (model.shared_std == "guider")
 
 
 def test_both_policies_have_one_std(model):
     guider, learner, _ = model.policy.distributions(_observations())
     assert th.equal(guider.log_std, learner.log_std)
-    owner = getattr(model.policy, model.std_of)
+    owner = getattr(model.policy, model.shared_std)
     assert th.equal(guider.log_std, owner(_observations()).log_std)
 
 
 @pytest.mark.parametrize("guider", ["residual", "independent"])
 def test_log_std_loss_moves_its_head_alone(guider):
-    model = small_model(guider=guider, std_of="guider")
+    model = small_model(guider=guider, shared_std="guider")
     guider, _, deployed = model.policy.distributions(_observations())
     loss = log_std_loss(deployed.log_std, guider.log_std.detach() + 1)
     assert _reached(model.policy, loss) == {"learner_log_std"}
@@ -181,7 +181,7 @@ def test_guider_does_depend_on_privileged():
 
 def test_a_log_std_head_that_is_fitted_has_no_say_in_the_clipping_of_the_learner():
     """Its gradient belongs to another loss: a huge one must not shrink the learner's."""
-    model = _filled(GAC, max_grad_norm=1.0, std_of="guider")
+    model = _filled(GAC, max_grad_norm=1.0, shared_std="guider")
     head = list(model.policy.learner.head.log_std.parameters())
     flat = model.policy.flat_parameters["learner"]
     assert [id(p) for p in flat.parameters[-2:]] == [id(p) for p in head]

@@ -91,7 +91,7 @@ class Settings:
     """
     Arguments of the algorithms; what they decide by "auto" is written out.
 
-    :param std_of: whose std guider and learner have
+    :param shared_std: whose std guider and learner have
     :param pull: weight of the KL in the learner's objective, as a multiple of alpha
     :param rates: network -> learning rate, where it is not ``learning_rate``
     """
@@ -109,7 +109,7 @@ class Settings:
     kl_reduction: str = "mean"
     guider: str = "residual"
     max_kl: float | None = None
-    std_of: str = "learner"
+    shared_std: str = "learner"
     pull: float = 0.0
     learner_entropy: bool = True
     max_grad_norm: float | None = None
@@ -243,13 +243,13 @@ class PlainGAC(PlainAlgorithm):
         mu, pi = self.distribution(guider_outputs), self.distribution(learner_outputs)
         if isinstance(mu, Choice) or isinstance(pi, Choice):
             return (Choice(pi.logits.detach() + mu.logits), pi) if settings.guider == "residual" else (mu, pi)
-        std = pi.std if settings.std_of == "learner" else mu.std
+        std = pi.std if settings.shared_std == "learner" else mu.std
         delta = mu.mean if settings.guider == "residual" else (mu.mean - pi.mean.detach()) / std.detach()
         if settings.max_kl is not None:  # KL = sum or mean of delta^2 / 2
             dimensions = delta.shape[-1] if settings.kl_reduction == "mean" else 1
             delta = delta * ((2 * settings.max_kl * dimensions) ** 0.5 / delta.norm(dim=-1, keepdim=True)).clamp(max=1)
         guider_mean = pi.mean.detach() + std.detach() * delta
-        if settings.std_of == "learner":
+        if settings.shared_std == "learner":
             return Gaussian(guider_mean, std.detach()), Gaussian(pi.mean, std)
         return Gaussian(guider_mean, std), Gaussian(pi.mean, std.detach())
 
@@ -306,7 +306,7 @@ class PlainGAC(PlainAlgorithm):
     def fit_of_the_std(self, batch: Batch, guider_outputs: dict[str, th.Tensor]) -> tuple[Any, list[nn.Parameter]]:
         """Where the guider has the std: the learner's own, for deployment, is fitted to it; nothing but its layer moves."""
         learner = self.networks["learner"]
-        if "logits" in guider_outputs or self.settings.std_of == "learner":
+        if "logits" in guider_outputs or self.settings.shared_std == "learner":
             return 0.0, []
         hidden = learner.hidden(self.seen(learner, batch)[0]).detach()
         outputs = learner.heads["log_std"](hidden), guider_outputs["log_std"]

@@ -1,0 +1,216 @@
+"""Constructor arguments, each written once: those that all off-policy algorithms share, and how a class adds its own."""
+
+import inspect
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import wraps
+from inspect import Parameter
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, TypedDict, get_args, get_type_hints
+
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_gac.base.roles import RoleKeys
+from sb3_gac.checks.arguments import merged
+
+
+class PositionalArguments(TypedDict, total=False):
+    """What SB3's SAC takes after ``policy`` and ``env``, in its order: each a type and a default."""
+
+    learning_rate: Annotated[float | Schedule, 3e-4]
+    buffer_size: Annotated[int, 1_000_000]
+    learning_starts: Annotated[int, 100]
+    batch_size: Annotated[int, 256]
+    tau: Annotated[float, 0.005]
+    gamma: Annotated[float, 0.99]
+    train_freq: Annotated[int | tuple[int, str], 1]
+    gradient_steps: Annotated[int, 1]
+    action_noise: Annotated[ActionNoise | None, None]
+    replay_buffer_class: Annotated[type[ReplayBuffer] | None, None]
+    replay_buffer_kwargs: Annotated[dict[str, Any] | None, None]
+    optimize_memory_usage: Annotated[bool, False]
+    n_steps: Annotated[int, 1]
+    ent_coef: Annotated[str | float, "auto"]
+    target_update_interval: Annotated[int, 1]
+    target_entropy: Annotated[str | float, "auto"]
+
+
+class OffPolicyArguments(PositionalArguments, total=False):
+    """
+    All that off-policy algorithms share but ``policy`` and ``env``, described by ``AsymmetricOffPolicyAlgorithm``.
+
+    A subclass with arguments of its own names these alone, keyword-only, and hands on what it does not know::
+
+        def __init__(self, policy, env, *sb3, teacher, coef_step=0.01, **shared: Unpack[OffPolicyArguments]):
+            self.teacher, self.coef_step = teacher, coef_step
+            super().__init__(policy, env, *sb3, **shared)
+    """
+
+    max_grad_norm: Annotated[float | None, 1.0]
+    lr_scales: Annotated[Mapping[str, float] | None, None]
+    role_keys: Annotated[RoleKeys | None, None]
+    compile: Annotated[bool, False]
+    mixed_precision: Annotated[bool, False]
+    stats_window_size: Annotated[int, 100]
+    tensorboard_log: Annotated[str | None, None]
+    policy_kwargs: Annotated[dict[str, Any] | None, None]
+    verbose: Annotated[int, 0]
+    seed: Annotated[int | None, None]
+    device: Annotated[th.device | str, "auto"]
+    _init_setup_model: Annotated[bool, True]
+
+
+def _shared_parameters() -> list[Parameter]:
+    parameters = []
+    for name, hint in get_type_hints(OffPolicyArguments, include_extras=True).items():
+        by_position = name in PositionalArguments.__annotations__
+        kind = Parameter.POSITIONAL_OR_KEYWORD if by_position else Parameter.KEYWORD_ONLY
+        annotation, default = get_args(hint)
+        parameters.append(Parameter(name, kind, default=default, annotation=annotation))
+    return parameters
+
+
+SHARED = inspect.Signature(_shared_parameters())
+
+
+def with_defaults(by_position: Sequence[Any], by_name: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param by_position: values of the first shared arguments
+    :param by_name: others
+    :return: name -> value of each shared argument
+    :raises TypeError: Python's own, if there are too many or one is given twice
+    """
+    bound = SHARED.bind(*by_position, **by_name)
+    bound.apply_defaults()
+    return bound.arguments
+
+
+class ConstructorArguments:
+    """
+    The signature of a class's constructor has what it hands on, too, and former names of arguments stand for present ones.
+
+    Each argument is kept as the attribute of its name, so that files hold it.
+    """
+
+    #: Former name -> present name, for one release; a subclass writes its own, and its ancestors' count as well
+    renamed_arguments: ClassVar[Mapping[str, str]] = {}
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if not hasattr(cls.__init__, "__signature__"):  # its own, or that of a mixin
+            type.__setattr__(cls, "__init__", _prepared(cls.__init__, inspect.Signature(_constructor_parameters(cls.__mro__))))
+        for former, present in merged(cls, "renamed_arguments").items():
+            setattr(cls, former, _former_attribute(former, present))
+
+
+def _is_ours(kind: type) -> bool:
+    return issubclass(kind, ConstructorArguments)
+
+
+def _constructor_parameters(mro: Sequence[type]) -> list[Parameter]:
+    """
+    :param mro: a class and its ancestors, in the order of resolution
+    :return: what the first constructor takes itself, and what it hands on to the next one
+    """
+    kind, *others = [kind for kind in mro if "__init__" in vars(kind)]
+    own = list(inspect.signature(inspect.unwrap(vars(kind)["__init__"])).parameters.values())
+    positional = [each for each in own if each.kind <= Parameter.POSITIONAL_OR_KEYWORD]
+    by_name = [each for each in own if each.kind is Parameter.KEYWORD_ONLY]
+    variable = {each.kind: each.annotation for each in own if each not in [*positional, *by_name]}
+    if Parameter.VAR_KEYWORD not in variable or not others:
+        return [*positional, *by_name]
+    handed_on = _constructor_parameters(others)
+    if get_args(variable[Parameter.VAR_KEYWORD]) == (OffPolicyArguments,) and not any(map(_is_ours, others)):
+        handed_on = list(SHARED.parameters.values())
+    named_before, named_behind = ({each.name for each in group} for group in (positional, by_name))
+    by_position = Parameter.VAR_POSITIONAL in variable
+    for each in handed_on:
+        if each.name in named_before:
+            continue
+        # What the class names itself can't come by position, nor can what follows it
+        by_position &= each.name not in named_behind and each.kind <= Parameter.POSITIONAL_OR_KEYWORD
+        by_position &= each.default is not Parameter.empty or all(one.default is Parameter.empty for one in positional)
+        if by_position:
+            positional.append(each)
+        elif each.name not in named_behind:
+            by_name.append(each.replace(kind=Parameter.KEYWORD_ONLY))
+    return [*positional, *by_name]
+
+
+def _prepared(init: Callable[..., None], signature: inspect.Signature) -> Callable[..., None]:
+    """
+    :param init: a class's constructor
+    :param signature: with what it hands on
+    :return: the same, which says so, and which gets arguments by their present names
+    """
+    named = [each for each in signature.parameters.values() if each.kind is not Parameter.VAR_KEYWORD]
+    needed = [each.name for each in named if each.default is Parameter.empty]
+
+    @wraps(init)
+    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
+        if type(self).__init__ is __init__:  # and not a subclass's, which calls this one
+            kwargs = present_names(type(self), kwargs, f"{type(self).__name__}()")
+            saved = _SAVED.get().get(type(self), {})
+            kwargs = {name: saved[name] for name in needed if name in saved} | kwargs
+        init(self, *args, **kwargs)
+
+    __init__.__signature__ = signature  # type: ignore[attr-defined]
+    return __init__
+
+
+def _former_attribute(former: str, present: str) -> property:
+    def warn(model: Any) -> None:
+        kind = type(model).__name__
+        warnings.warn(f"{kind}.{former} is {kind}.{present} now.", DeprecationWarning, stacklevel=3)
+
+    def read(model: Any) -> Any:
+        warn(model)
+        return getattr(model, present)
+
+    def write(model: Any, value: Any) -> None:
+        warn(model)
+        setattr(model, present, value)
+
+    return property(read, write)
+
+
+def present_names(kind: type, given: Mapping[str, Any], where: str | None) -> dict[str, Any]:
+    """
+    :param kind: a class
+    :param given: name -> argument
+    :param where: they were given, for the warning about former names; ``None`` for a file, which nobody can be blamed for
+    :return: the same by their present names
+    :raises TypeError: if an argument is given by both names
+    """
+    renamed = merged(kind, "renamed_arguments")
+    for former in [name for name in given if name in renamed]:
+        present = renamed[former]
+        if present in given:
+            raise TypeError(f'{where or kind.__name__} got "{present}" twice, also by its former name: leave "{former}" out.')
+        if where is not None:
+            warnings.warn(f'{where} got "{former}", which is "{present}" now.', DeprecationWarning, stacklevel=3)
+    return {renamed.get(name, name): value for name, value in given.items()}
+
+
+#: Class -> attributes in the file that is being loaded
+_SAVED: ContextVar[Mapping[type, Mapping[str, Any]]] = ContextVar("saved", default=MappingProxyType({}))
+
+
+@contextmanager
+def needed_arguments_from(saved: Mapping[str, Any], kind: type) -> Iterator[None]:
+    """
+    SB3's ``load`` calls the constructor with ``policy``, ``env`` and ``device`` alone, and restores attributes afterwards.
+
+    :param saved: attributes; of the arguments that have no default, those that are among them are given to the constructor
+    :param kind: class that is loaded
+    """
+    token = _SAVED.set({kind: saved})
+    try:
+        yield
+    finally:
+        _SAVED.reset(token)
