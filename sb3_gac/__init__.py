@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
     from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
+    from sb3_gac.baselines.tgrl import TGRL
     from sb3_gac.checkpoint.files import CheckpointError
     from sb3_gac.checks.divergence import DivergenceError
     from sb3_gac.checks.environments import EnvironmentFailedError, InvalidStepError
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 _WHERE = {
     "GAC": "gac.gac",
     "PRESETS": "gac.presets",
+    "TGRL": "baselines.tgrl",
     "AsymmetricSAC": "baselines.asymmetric_sac",
     "CheckpointError": "checkpoint.files",
     "CompactDictReplayBuffer": "replay.buffer",
@@ -69,6 +71,7 @@ def __dir__() -> list[str]:
 __all__ = [
     "GAC",
     "PRESETS",
+    "TGRL",
     "AsymmetricSAC",
     "CheckpointError",
     "CompactDictReplayBuffer",

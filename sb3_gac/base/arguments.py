@@ -15,6 +15,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_gac.base.behaviour import BehaviourSpec
 from sb3_gac.base.roles import RoleKeys
 from sb3_gac.checks.arguments import merged
 
@@ -52,6 +53,10 @@ class OffPolicyArguments(PositionalArguments, total=False):
     """
 
     max_grad_norm: Annotated[float | None, 1.0]
+    policy_delay: Annotated[int, 1]
+    update_every: Annotated[Mapping[str, int] | None, None]
+    behaviour: Annotated[BehaviourSpec, None]
+    behaviour_per: Annotated[str, "episode"]
     lr_scales: Annotated[Mapping[str, float] | None, None]
     role_keys: Annotated[RoleKeys | None, None]
     compile: Annotated[bool, False]

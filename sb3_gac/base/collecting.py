@@ -1,6 +1,7 @@
 """Collecting data: every step that was taken is stored and none is invented, whoever stops, interrupts or interferes."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,24 @@ class DataCollection(OffPolicyAlgorithm):
     _last_use: tuple[EnvironmentGuard | None, int] = (None, 0)
     _replay_source: ReplaySource | None = None
     _used_elsewhere_said = False
+    #: Of each environment: role of the policy that acts, return of the episode so far, whether actions in it were uniform
+    acting: Sequence[str] = ()
+    _returns_so_far: Any = None
+    _has_warmed_up: Any = None
+
+    # --- hooks, for algorithms -----------------------------------------------------------------------------------------
+
+    def on_step(self) -> None:
+        """After each step of the environments, once it is stored."""
+
+    def on_episode_end(self, env: int, episode_return: float, role: str | None) -> None:
+        """
+        After an episode's last step, once it is stored and before :meth:`on_step`.
+
+        :param env: number of the environment
+        :param episode_return: sum of the rewards as they are stored, that is, before normalisation
+        :param role: of the policy that has acted; ``None`` if actions of the warm-up were among its own
+        """
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -134,6 +153,9 @@ class DataCollection(OffPolicyAlgorithm):
         assert isinstance(self._last_obs, dict)
         self._last_original_obs = self.replay_source.observation(self._last_obs)
         self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
+        self.acting = [str(self.policy.roles.behaviour)] * self.env.num_envs  # type: ignore[union-attr]
+        self._returns_so_far = np.zeros(self.env.num_envs)
+        self._has_warmed_up = np.zeros(self.env.num_envs, dtype=bool)
         self._note_use()
 
     def _note_use(self) -> None:
@@ -187,6 +209,7 @@ class DataCollection(OffPolicyAlgorithm):
             self._rollout_steps += 1
             self._update_info_buffer(infos, dones)
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            self._call_hooks(dones)
             self._on_step()
             logs_are_due = self._count_episodes(dones, action_noise, log_interval)
             num_collected_steps, num_collected_episodes = self._rollout_steps, self._rollout_episodes
@@ -199,6 +222,13 @@ class DataCollection(OffPolicyAlgorithm):
             callback.on_rollout_end()
             self._rollout_steps, self._rollout_episodes = 0, 0
         return result
+
+    def _call_hooks(self, dones: np.ndarray) -> None:
+        for index in np.flatnonzero(dones).tolist():
+            role = None if self._has_warmed_up[index] else self.acting[index]
+            self.on_episode_end(index, float(self._returns_so_far[index]), role)
+        self._returns_so_far[dones], self._has_warmed_up[dones] = 0.0, False
+        self.on_step()
 
     def _count_episodes(self, dones: np.ndarray, action_noise: ActionNoise | None, log_interval: int | None) -> bool:
         """
@@ -234,7 +264,9 @@ class DataCollection(OffPolicyAlgorithm):
             final = source.final(infos[index])
             for key, values in next_obs.items():
                 values[index] = final[key]
-        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, source.reward(reward), dones, infos)  # type: ignore[arg-type]
+        rewards = source.reward(reward)
+        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, rewards, dones, infos)  # type: ignore[arg-type]
+        self._returns_so_far += rewards
         self._last_obs, self._last_original_obs, self._last_episode_starts = new_obs, following, np.array(dones)
 
     def _excluded_save_params(self) -> list[str]:

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Mapping
 from copy import deepcopy
+from os import PathLike
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,15 +12,18 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self, Unpack
 
 from sb3_gac.base.arguments import ConstructorArguments, OffPolicyArguments, present_names, with_defaults
+from sb3_gac.base.behaviour import Behaviour, BehaviourSpec
+from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
 from sb3_gac.base.overrides import algorithm_of, check_known
 from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
 from sb3_gac.base.resuming import ResumableAlgorithm
-from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_rnn_types, resolve_role_keys
+from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_rnn_types, resolve_role_keys, resolve_update_every
 from sb3_gac.base.strict_predict import DeploymentGuard
 from sb3_gac.checks.arguments import (
     KEPT_AS,
@@ -76,6 +80,11 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
     :param target_update_interval: gradient steps between two updates of the targets
     :param target_entropy: in nats: "auto", "sac" or a number, see :func:`sb3_gac.networks.heads.resolve_target_entropy`
     :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
+    :param policy_delay: gradient steps to each step of a policy; critics take all
+    :param update_every: network -> gradient steps to each step of its own, "critic" standing for all critics
+    :param behaviour: which policy collects the data, by name, or network -> share of episodes, a number or a schedule; by
+        default that of the algorithm
+    :param behaviour_per: "episode", or "environment" for shares of the environments
     :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
         "critic" stands for all critics: where ``privileged`` is the whole state, spare them the sensor noise with
@@ -98,6 +107,10 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
     argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = SHARED_CHECKS
     #: Arguments that files hold results of: given to ``load`` or ``resume``, they count once those are restored
     restored_arguments: ClassVar[tuple[str, ...]] = ("ent_coef", "lr_scales", "stats_window_size")
+    #: Arguments that are models, or their paths, and that training asks for their policies, see :attr:`frozen`
+    frozen_arguments: ClassVar[tuple[str, ...]] = ()
+    #: Name of such an argument -> its policy, from the first ``learn`` on
+    frozen: dict[str, FrozenPolicy]
     policy_class: type[AsymmetricPolicy]
     policy: AsymmetricPolicy
     ent_coef_dual: Coefficient
@@ -118,6 +131,10 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         self.target_entropy: str | float = arguments.pop("target_entropy")
         self.target_update_interval: int = arguments.pop("target_update_interval")
         self.max_grad_norm: float | None = arguments.pop("max_grad_norm")
+        self.policy_delay: int = arguments.pop("policy_delay")
+        self.update_every: Mapping[str, int] | None = arguments.pop("update_every")
+        self.behaviour: BehaviourSpec = arguments.pop("behaviour")
+        self.behaviour_per: str = arguments.pop("behaviour_per")
         self.lr_scales: Mapping[str, float] | None = arguments.pop("lr_scales")
         self.role_keys: RoleKeys | None = arguments.pop("role_keys")
         self.compile: bool = arguments.pop("compile")
@@ -170,11 +187,15 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         )
         if self.compile:
             self._check_can_compile(side_effects)
-        self._update_every: dict[str, int] = {}
+        self._update_every = resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
+        self.chooses_behaviour = Behaviour(self.policy_class.roles, self.behaviour, self.behaviour_per)
         self.coefficients = self.make_coefficients()
         self._keep_coefficients()
         self.programs = {}
         self._behaviour_state: BehaviourState = None
+        self.frozen = {}
+        if self.env is not None:  # to act takes no teacher
+            self._load_frozen(needed=False)
         if self.env is not None:
             _ = self.replay_source  # which may refuse, or warn
 
@@ -214,6 +235,8 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
         check_goals(self.replay_buffer_class, self.observation_space, self.env)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
+        resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
+        Behaviour(self.policy_class.roles, self.behaviour, self.behaviour_per)
         if self.is_recurrent:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
@@ -319,17 +342,29 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         :return: action for the environments, and the same scaled to [-1, 1] for the buffer
         """
         warms_up = self.num_timesteps < learning_starts
+        assert self._last_episode_starts is not None
+        self.acting = self.choose_acting(self._last_episode_starts)
+        self._has_warmed_up |= warms_up
         if warms_up and not self.is_recurrent:
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, dict)
         scaled_action, self._behaviour_state = self.policy.behaviour_action(
-            self._last_obs, self._behaviour_state, self._last_episode_starts
+            self._last_obs, self._behaviour_state, self._last_episode_starts, acting=self.acting
         )
         if warms_up:  # the memory was brought up
             return super()._sample_action(learning_starts, action_noise, n_envs)
         if action_noise is not None:
             scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
         return self._in_environments_range(scaled_action), scaled_action
+
+    def choose_acting(self, episode_start: np.ndarray) -> list[str]:
+        """
+        Which policy acts in each environment, see ``behaviour``; to be overridden by algorithms with a rule of their own.
+
+        :param episode_start: true where an episode starts, shape (n_envs,)
+        :return: role of the policy, of each environment; one that has acted stays to the episode's end
+        """
+        return self.chooses_behaviour.choose(self.acting, episode_start, self._current_progress_remaining)
 
     def _in_environments_range(self, action: np.ndarray) -> np.ndarray:
         """
@@ -341,7 +376,24 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         result = super()._setup_learn(*args, **kwargs)
         assert self.env is not None
         check_rewards_of_goals(self.replay_buffer_class, self.replay_buffer_kwargs, self.env)
+        self._load_frozen(needed=True)
         return result
+
+    def _load_frozen(self, needed: bool) -> None:
+        """
+        :param needed: whether training is about to begin
+        :raises ValueError: if one is not there that is needed, or was trained on other spaces
+        """
+        assert isinstance(self.observation_space, spaces.Dict)
+        for name in set(self.frozen_arguments) - set(self.frozen):
+            source = getattr(self, name)
+            if source is not None:
+                self.frozen[name] = load_frozen_policy(source, self.observation_space, self.action_space, self.device, name)
+            elif needed:
+                raise ValueError(
+                    f"{type(self).__name__} trains with a {name}: pass {name}=<a trained model or its path>, to load() and "
+                    "resume() as well."
+                )
 
     def learn(
         self,
@@ -366,6 +418,20 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
             if "optim" in name:
                 state["param_groups"] = plain(state["param_groups"], arrays=True)
         return parameters
+
+    def set_parameters(
+        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """See SB3's ``set_parameters``; optimisers' state of earlier versions becomes that of present ones."""
+        parameters = load_path_or_dict
+        if not isinstance(parameters, dict):
+            _, parameters, _ = load_from_zip_file(parameters, device=device, load_data=False)
+        parameters = dict(parameters)
+        for role, network in self.policy.trained.items():
+            name = f"policy.{role}.optimizer"
+            if name in parameters:
+                parameters[name] = network.in_present_layout(parameters[name])
+        super().set_parameters(parameters, exact_match, device)
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         """See SB3's ``load_replay_buffer``; how the buffer is sampled is the model's to say, not the file's."""
@@ -402,7 +468,9 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
 
     def _excluded_save_params(self) -> list[str]:
         coefficients = [f"{name}_dual" for name in self.coefficients]
-        return [*super()._excluded_save_params(), *coefficients, "coefficients", "programs", "_program_key"]
+        others = ["coefficients", "programs", "_program_key", "chooses_behaviour", "frozen"]
+        others += [name for name in self.frozen_arguments if not isinstance(getattr(self, name), (str, PathLike))]
+        return [*super()._excluded_save_params(), *coefficients, *others]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", *(f"policy.{name}.optimizer" for name in self.policy.trained)]

@@ -51,6 +51,9 @@ PROGRESS = (
     "_last_original_obs",
     "_last_episode_starts",
     "_behaviour_state",
+    "acting",
+    "_returns_so_far",
+    "_has_warmed_up",
     "ep_info_buffer",
     "ep_success_buffer",
     "strict_deployment",
@@ -58,6 +61,8 @@ PROGRESS = (
 )
 #: Arguments that what a checkpoint holds was made with
 FIXED = ("policy", "policy_kwargs", "buffer_size", "replay_buffer_class")
+#: Of what a checkpoint holds, what is encoded
+STATES = ("progress", "training_state", "generators", "env", "buffer")
 _STATE, _ARRAYS, _TENSORS = "state.json", "arrays.npz", "tensors.pt"
 
 
@@ -128,6 +133,7 @@ class ResumableAlgorithm(NetworkTraining):
             "spaces": _describe_spaces(self.observation_space, self.action_space),
             "n_envs": self.n_envs,
             "progress": encode({name: getattr(self, name) for name in PROGRESS}, arrays),
+            "training_state": encode(self.training_state(), arrays),
             "generators": encode(self._generator_states(), arrays),
             "env": encode(None if self.env is None else vec_env_state(self.env), arrays),
             "buffer": encode(buffer.bookkeeping() | {"blocks": saved.names}, arrays),
@@ -188,6 +194,13 @@ class ResumableAlgorithm(NetworkTraining):
         free = {name: recursive_getattr(self, name).detach() for name in names}
         return {"parameters": self.get_parameters(), "free": free}
 
+    def training_state(self) -> dict[str, Any]:
+        """
+        What an algorithm's own hooks have gathered, for checkpoints: attributes by name, of numbers, strings, arrays, lists,
+        dicts and deques. :meth:`resume` sets them.
+        """
+        return {}
+
     # --- resuming ---------------------------------------------------------------------------------------------------
 
     @classmethod
@@ -227,9 +240,7 @@ class ResumableAlgorithm(NetworkTraining):
         model._check_fixed_arguments(given, before)
         tensors = th.load(io.BytesIO(files[_TENSORS]), map_location=model.device, weights_only=True)
         with networks_named(path, list(given)):
-            model._restore(
-                root, tensors, {name: decode(state[name], arrays) for name in ("progress", "generators", "env", "buffer")}
-            )
+            model._restore(root, tensors, {name: decode(state[name], arrays) for name in STATES if name in state})
         if model.seed is not None and model.seed != before.get("seed"):
             model.set_random_seed(model.seed)
         vars(model).update(settings)
@@ -260,7 +271,7 @@ class ResumableAlgorithm(NetworkTraining):
         self.policy.freeze_as_saved()
         for name, value in tensors["free"].items():
             recursive_setattr(self, f"{name}.data", value.data)
-        for name, value in state["progress"].items():
+        for name, value in (state["progress"] | state.get("training_state", {})).items():
             setattr(self, name, value)
         self._resumed_noise = self.action_noise
         self._read_rows(root, state["buffer"])

@@ -26,6 +26,7 @@ class Roles(NamedTuple):
     :param actors: other policies
     :param critics: ensembles that value actions, each with a target
     :param target_policies: those policies that have a target as well
+    :param unprivileged: those that see no more than the deployed policy, unless they are told to
     :param collects: the policy that acts in training, by default the deployed one
     """
 
@@ -33,6 +34,7 @@ class Roles(NamedTuple):
     actors: tuple[str, ...] = ()
     critics: tuple[str, ...] = ()
     target_policies: tuple[str, ...] = ()
+    unprivileged: tuple[str, ...] = ()
     collects: str | None = None
 
     @property
@@ -81,8 +83,8 @@ def resolve_role_keys(
     """
     Complete and check the mapping from roles to observation entries.
 
-    By default the deployed policy reads ``partial`` alone and every other role reads every entry: a guider must see
-    what its learner sees, noise included, or it cannot stay close to it.
+    By default the deployed policy reads ``partial`` alone, unprivileged roles read what it reads, and every other role reads
+    every entry: a guider must see what its learner sees, noise included, or it cannot stay close to it.
 
     :param observation_space: of the environment
     :param roles: of the algorithm
@@ -99,6 +101,7 @@ def resolve_role_keys(
             f'{roles.deployed} may see to "{PARTIAL}", or name it with role_keys={{"{roles.deployed}": ["<entry>"]}}.'
         )
     resolved = dict.fromkeys(roles.all, entries) | {roles.deployed: (PARTIAL,)}
+    resolved |= dict.fromkeys(roles.unprivileged, tuple(role_keys.get(roles.deployed, (PARTIAL,))))
     for name, keys in role_keys.items():
         if isinstance(keys, str) or not keys:
             raise ValueError(f'role_keys["{name}"] must be a non-empty list of observation entries, got {keys!r}.')
@@ -154,6 +157,22 @@ def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> di
     for role, scale in lr_scales.items():
         check_positive(f'lr_scales["{role}"]', scale)
     return dict.fromkeys(roles.all, 1.0) | _for_each_role(roles, lr_scales)
+
+
+def resolve_update_every(roles: Roles, policy_delay: int, update_every: Mapping[str, int] | None) -> dict[str, int]:
+    """
+    How often networks take a step.
+
+    :param roles: of the algorithm
+    :param policy_delay: gradient steps to each step of a policy
+    :param update_every: role, or "critic" for all critics -> gradient steps to each of its own, where that differs
+    :return: role -> gradient steps, for all roles
+    :raises ValueError: if a role is unknown or a number is not a whole one above 0
+    """
+    given = _check_roles("update_every", roles, update_every or {})
+    for role, every in given.items():
+        check_integer(f'update_every["{role}"]', every, 1)
+    return dict.fromkeys(roles.all, 1) | dict.fromkeys(roles.policies, policy_delay) | _for_each_role(roles, given)
 
 
 def resolve_rnn_types(roles: Roles, rnn_type: str | Mapping[str, str | None] | None) -> dict[str, str | None]:

@@ -6,7 +6,7 @@ that bookkeeping takes as long as the arithmetic.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
@@ -87,6 +87,25 @@ class TrainedParameters:
             self.everything, self.optimizer.param_groups[0].get("trained", self.trained), strict=True
         ):
             parameter.requires_grad_(trained)
+
+    def in_present_layout(self, state: dict[str, Any]) -> dict[str, Any]:
+        """
+        :param state: an optimiser's ``state_dict``, of this version or of those that laid all parameters out as one
+        :return: with an entry for each parameter
+        """
+        (group,) = state["param_groups"]
+        if len(group["params"]) == len(self.everything):
+            return state
+        trained = group.get("trained", [True] * len(self.everything))
+        indices = [index for index, was_trained in enumerate(trained) if was_trained]
+        shapes = [self.everything[index].shape for index in indices]
+        entries: dict[int, dict[str, th.Tensor]] = {index: {} for index in indices} if state["state"] else {}
+        for name, value in state["state"].get(0, {}).items():
+            flat = value.dim() == 1 and len(value) == sum(shape.numel() for shape in shapes)
+            parts = value.split([shape.numel() for shape in shapes]) if flat else [value.clone() for _ in shapes]
+            for index, part, shape in zip(indices, parts, shapes, strict=True):
+                entries[index][name] = part.reshape(shape).clone() if flat else part
+        return {"state": entries, "param_groups": [{**group, "params": list(range(len(self.everything)))}]}
 
     def step(self, gradients: Sequence[th.Tensor], max_norm: float | None) -> th.Tensor:
         """

@@ -1,0 +1,54 @@
+"""Which policy collects the data: one, or a share of episodes or of environments for each."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_gac.base.roles import Roles
+from sb3_gac.checks.values import check_choice
+
+#: A policy's role, or role -> share of episodes, a number or a schedule; the default policy has the rest
+BehaviourSpec: TypeAlias = str | Mapping[str, float | Schedule] | None
+
+
+class Behaviour:
+    """
+    Chooses which policy acts in each environment.
+
+    :param roles: of the algorithm
+    :param behaviour: see ``BehaviourSpec``; ``None`` for the policy that the algorithm collects with
+    :param per: "episode": drawn anew at each episode's start; "environment": the share is one of environments
+    :raises ValueError: if a role is no policy, or shares are not from 0 to 1
+    """
+
+    def __init__(self, roles: Roles, behaviour: BehaviourSpec, per: str = "episode"):
+        self.default = behaviour if isinstance(behaviour, str) else roles.behaviour
+        self.shares: dict[str, Any] = dict(behaviour) if isinstance(behaviour, Mapping) else {}
+        self.per = per
+        for role in (self.default, *self.shares):
+            check_choice("behaviour: a policy", role, roles.policies)
+        self._shares_now(1.0)
+
+    def _shares_now(self, progress_remaining: float) -> dict[str, float]:
+        now = {role: float(share(progress_remaining) if callable(share) else share) for role, share in self.shares.items()}
+        if not (all(0 <= share <= 1 for share in now.values()) and sum(now.values()) <= 1 + 1e-9):
+            raise ValueError(f"behaviour must be shares from 0 to 1 that sum up to 1 at most, got {now}.")
+        return now
+
+    def choose(self, acting: Sequence[str], episode_start: np.ndarray, progress_remaining: float) -> list[str]:
+        """
+        :param acting: role that acted last in each environment
+        :param episode_start: true where an episode starts, shape (n_envs,)
+        :param progress_remaining: from 1 to 0
+        :return: role that acts now in each environment; it changes at an episode's start alone
+        """
+        if not self.shares or not episode_start.any():
+            return list(acting) if self.shares else [self.default] * len(episode_start)
+        shares = self._shares_now(progress_remaining)
+        names, limits = list(shares), np.cumsum(list(shares.values()))
+        n_envs = len(episode_start)
+        drawn = np.random.rand(n_envs) if self.per == "episode" else (np.arange(n_envs) + 0.5) / n_envs
+        chosen = [next((name for name, limit in zip(names, limits, strict=True) if u < limit), self.default) for u in drawn]
+        return [new if starts else old for new, old, starts in zip(chosen, acting, episode_start, strict=True)]

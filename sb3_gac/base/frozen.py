@@ -1,0 +1,89 @@
+"""Policies that are there already: a teacher that is asked and never trained."""
+
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.checks.entries import encode
+from sb3_gac.math.distributions import TanhGaussian
+
+
+class FrozenPolicy(nn.Module):
+    """
+    The policy with which a trained model collected its data, on full observations; nothing trains it.
+
+    :param model: of this package, or SB3's SAC on a Dict space
+    :param name: of the argument, for messages
+    :raises TypeError: if the model is another one
+    :raises ValueError: if its policy has a memory
+    """
+
+    def __init__(self, model: BaseAlgorithm, name: str = "teacher"):
+        super().__init__()
+        if not (isinstance(model, SAC) or isinstance(model.policy, AsymmetricPolicy)):
+            raise TypeError(f"{name} must be a model of sb3_gac, or SB3's SAC on a Dict space, got {type(model).__name__}.")
+        self.policy = model.policy
+        if isinstance(self.policy, AsymmetricPolicy) and any(self.policy.rnn_types.values()):
+            raise ValueError(f"{name} has a memory, and it is asked about single transitions: train one without.")
+        self.requires_grad_(False)
+        self.train(False)
+
+    @th.no_grad()
+    def forward(self, obs: PyTorchObs) -> Any:
+        r"""
+        :param obs: full observation, (\*E, ...) of each entry
+        :return: distribution of actions, shapes (\*E, A)
+        """
+        policy: Any = self.policy
+        if isinstance(policy, AsymmetricPolicy):
+            outputs = {role: getattr(policy, role).distribution(obs) for role in policy.roles.policies}
+            return policy.action_distributions(outputs)[policy.roles.behaviour]
+        space = policy.observation_space
+        entries = {key: encode(obs[key], space[key], policy.normalize_images) for key in space.spaces}
+        latent = policy.actor.latent_pi(policy.actor.features_extractor(entries))
+        return TanhGaussian(policy.actor.mu(latent), policy.actor.log_std(latent).clamp(-20, 2))
+
+
+def load_frozen_policy(
+    source: str | Path | BaseAlgorithm,
+    observation_space: spaces.Dict,
+    action_space: spaces.Space,
+    device: th.device,
+    name: str = "teacher",
+) -> FrozenPolicy:
+    """
+    :param source: a trained model, or the path of one of this package's that was saved
+    :param observation_space: of the environment; the teacher must know all of its entries
+    :param action_space: of the environment
+    :param device: where it is to be asked
+    :param name: of the argument, for messages
+    :raises ValueError: if its spaces are others
+    """
+    model = _loaded(Path(source), device, name) if isinstance(source, (str, Path)) else source
+    frozen = FrozenPolicy(model, name).to(device)
+    assert isinstance(model.observation_space, spaces.Dict)
+    for key, space in model.observation_space.items():
+        if observation_space.spaces.get(key) != space:
+            now = observation_space.spaces.get(key, "missing")
+            raise ValueError(f'{name} was trained on an entry "{key}" that was {space}, and here it is {now}.')
+    if model.action_space != action_space:
+        raise ValueError(f"{name} was trained for actions in {model.action_space}, and here they are in {action_space}.")
+    return frozen
+
+
+def _loaded(path: Path, device: th.device, name: str) -> BaseAlgorithm:
+    import sb3_gac
+
+    data, _, _ = load_from_zip_file(path, device=device, load_data=True)
+    kind = getattr(sb3_gac, (data or {}).get("algorithm", ""), None)
+    if kind is None:
+        raise ValueError(f"{name}={str(path)!r} is no model that sb3_gac saved: pass the loaded model itself.")
+    return kind.load(path, device=device)

@@ -1,0 +1,192 @@
+"""Teacher-Guided RL: imitate a frozen teacher for as long as that pays off in return."""
+
+from collections import deque
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from typing_extensions import Unpack
+
+from sb3_gac.base.arguments import OffPolicyArguments
+from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.base.roles import Roles
+from sb3_gac.base.update import Batch, Loss, Metrics, Outputs
+from sb3_gac.checks.values import check_integer, check_not_negative
+from sb3_gac.math.losses import masked_mean, policy_loss
+from sb3_gac.networks.actors import Actor
+from sb3_gac.networks.critics import CriticEnsemble
+from sb3_gac.optim.coefficients import AdditiveCoefficient, Coefficient
+
+
+class TGRLPolicy(AsymmetricPolicy):
+    """
+    Main and auxiliary actor on ``partial``, a critic of the reward and one of the distance to the teacher; ``predict`` is
+    the main actor. Arguments are those of :class:`AsymmetricPolicy`.
+    """
+
+    roles = Roles("actor", ("auxiliary",), ("reward_critic", "teacher_critic"), unprivileged=("auxiliary",))
+    actor: Actor
+    auxiliary: Actor
+    reward_critic: CriticEnsemble
+    reward_critic_target: CriticEnsemble
+    teacher_critic: CriticEnsemble
+    teacher_critic_target: CriticEnsemble
+
+    @property
+    def critic(self) -> CriticEnsemble:
+        """SB3's name for the critic of the reward."""
+        return self.reward_critic
+
+    @property
+    def critic_target(self) -> CriticEnsemble:
+        """Target of :attr:`critic`."""
+        return self.reward_critic_target
+
+
+class TGRLGruPolicy(TGRLPolicy):
+    """All networks with a GRU each."""
+
+    default_rnn_type = "gru"
+
+
+class TGRLLstmPolicy(TGRLPolicy):
+    """All networks with an LSTM each."""
+
+    default_rnn_type = "lstm"
+
+
+class TGRL(AsymmetricOffPolicyAlgorithm):
+    """
+    A main actor earns reward and stays near a teacher that sees everything, an auxiliary one earns reward alone; the weight of
+    the teacher rises while the main actor's episodes are the better ones (Shenfeld et al. 2023, arXiv 2307.03186).
+
+    Arguments that are not described here are those of :class:`AsymmetricOffPolicyAlgorithm`.
+
+    :param teacher: a model that was trained on the full observation, or the path of a saved one; it stays as it is. ``None``
+        serves to load a student that is not trained further
+    :param teacher_coef: weight c of the teacher at the start
+    :param coef_step: by which c moves at each comparison
+    :param compare_every: environment steps between two comparisons of the actors' returns
+    :param window: episodes of each actor that are compared, the latest ones
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MultiInputPolicy": TGRLPolicy,
+        "MultiInputGruPolicy": TGRLGruPolicy,
+        "MultiInputLstmPolicy": TGRLLstmPolicy,
+    }
+    argument_checks: ClassVar[Mapping[str, Any]] = {
+        "teacher_coef": check_not_negative,
+        "coef_step": check_not_negative,
+        "compare_every": partial(check_integer, low=1),
+        "window": partial(check_integer, low=1),
+    }
+    frozen_arguments = ("teacher",)
+    compiled_settings = (*AsymmetricOffPolicyAlgorithm.compiled_settings, "target_entropy")
+    policy: TGRLPolicy
+
+    def __init__(
+        self,
+        policy: str | type[TGRLPolicy],
+        env: GymEnv | str | None,
+        *sb3: Any,
+        teacher: str | Path | BaseAlgorithm | None = None,
+        teacher_coef: float = 1.0,
+        coef_step: float = 0.01,
+        compare_every: int = 1_000,
+        window: int = 20,
+        **shared: Unpack[OffPolicyArguments],
+    ):
+        self.teacher = teacher
+        self.teacher_coef, self.coef_step, self.compare_every, self.window = teacher_coef, coef_step, compare_every, window
+        super().__init__(policy, env, *sb3, **shared)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.returns: dict[str, deque[float]] = {role: deque(maxlen=self.window) for role in self.policy.roles.policies}
+        self.next_comparison = self.compare_every
+
+    def make_coefficients(self) -> dict[str, Coefficient]:
+        """The entropy temperature, and the weight of the teacher."""
+        teacher_coef = AdditiveCoefficient(self.teacher_coef, self.coef_step, (0.0, 1e4), self.device)
+        return super().make_coefficients() | {"teacher_coef": teacher_coef}
+
+    # --- algorithm ----------------------------------------------------------------------------------------------------
+
+    def update(self, batch: Batch) -> Metrics:
+        """Both critics, then both actors; the teacher's weight follows from episodes, see :meth:`on_step`."""
+        beta, c = self.coefficients["ent_coef"].value, self.coefficients["teacher_coef"].value
+        noise = th.randn((4, *batch.actions.shape), device=self.device)
+        actor, auxiliary = self.outputs(batch, "actor", "auxiliary")
+        metrics = self.minimize("reward_critic", self.reward_critic_loss, batch, actor, noise[0], beta)
+        metrics |= self.minimize("teacher_critic", self.teacher_critic_loss, batch, actor, noise[1])
+        metrics |= self.minimize("actor", self.actor_loss, batch, actor, noise[2], beta, c)
+        metrics |= self.minimize("auxiliary", self.auxiliary_loss, batch, auxiliary, noise[3], beta)
+        metrics |= self.coefficients["ent_coef"].update(float(self.target_entropy) - metrics["entropy"])
+        return metrics | self.coefficient_values()
+
+    def reward_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
+        """Q_R: the main actor's return, with its entropy; both actors climb it."""
+        with th.no_grad():
+            next_q, log_prob = actor.later.expectation(batch.q_at_next_obs(self.policy.reward_critic_target), noise)
+            target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta)
+        return self.critic_loss("reward_critic", batch, target)
+
+    def teacher_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor) -> Loss:
+        """Q_I: discounted -KL(actor || teacher) from the next observation on, and no reward."""
+        with th.no_grad():
+            next_q, _ = actor.later.expectation(batch.q_at_next_obs(self.policy.teacher_critic_target), noise)
+            kl = actor.later.kl(self.frozen["teacher"](batch.next_observations))
+            target = batch.soft_target(next_q, reward=th.zeros_like(batch.rewards), kl=kl, kl_coef=1.0)
+        return self.critic_loss("teacher_critic", batch, target)
+
+    def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor, c: th.Tensor) -> Loss:
+        """beta log pi - min Q_R + c (KL - min Q_I)."""
+        now = self.now("actor", actor, batch)
+        q, log_prob = now.expectation(batch.q_at_obs(self.policy.reward_critic), noise)
+        q_teacher, _ = now.expectation(batch.q_at_obs(self.policy.teacher_critic), noise)
+        kl = now.kl(self.frozen["teacher"](batch.observations))
+        loss = policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask)
+        imitation = policy_loss(q=q_teacher, kl=kl, kl_coef=1.0, mask=batch.mask)
+        seen = {"entropy": -masked_mean(log_prob, batch.mask), "kl_to_teacher": masked_mean(kl, batch.mask)}
+        return Loss(loss + c * imitation, seen)
+
+    def auxiliary_loss(self, batch: Batch, auxiliary: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
+        """beta log pi_R - min Q_R."""
+        q, log_prob = self.now("auxiliary", auxiliary, batch).expectation(batch.q_at_obs(self.policy.reward_critic), noise)
+        return Loss(policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask), {})
+
+    # --- collecting ---------------------------------------------------------------------------------------------------
+
+    def choose_acting(self, episode_start: np.ndarray) -> list[str]:
+        """Main and auxiliary actor alternate by episode, in each environment."""
+        if self.behaviour is not None:
+            return super().choose_acting(episode_start)
+        other = {"actor": "auxiliary", "auxiliary": "actor"}
+        return [other[role] if starts else role for role, starts in zip(self.acting, episode_start, strict=True)]
+
+    def on_episode_end(self, env: int, episode_return: float, role: str | None) -> None:
+        """See :meth:`AsymmetricOffPolicyAlgorithm.on_episode_end`."""
+        if role is not None:
+            self.returns[role].append(episode_return)
+
+    def on_step(self) -> None:
+        """The teacher's weight takes a step: up where the main actor's latest episodes were the better ones."""
+        if self.num_timesteps < self.next_comparison:
+            return
+        self.next_comparison = self.num_timesteps - self.num_timesteps % self.compare_every + self.compare_every
+        if all(self.returns.values()):
+            main, auxiliary = (float(np.mean(self.returns[role])) for role in ("actor", "auxiliary"))
+            self.coefficients["teacher_coef"].move(np.sign(main - auxiliary))  # type: ignore[union-attr]
+            self.logger.record("rollout/main_minus_auxiliary", main - auxiliary)
+
+    def training_state(self) -> dict[str, Any]:
+        """See :meth:`AsymmetricOffPolicyAlgorithm.training_state`."""
+        return {"returns": self.returns, "next_comparison": self.next_comparison}
