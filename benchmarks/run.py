@@ -29,8 +29,9 @@ from stable_baselines3.common.logger import configure
 
 import sb3_gac
 from benchmarks.checkpoint import checkpoints_of, locked, write_atomically
-from benchmarks.config import POLICY, environment, instantiate, resolve
+from benchmarks.config import POLICY, environment, resolve
 from benchmarks.suite import HERE, RUNS, RunSpec, made_with, read_suite
+from sb3_gac.presets import instantiate
 
 EVAL_SEED = 10_000
 CONFIGURATION = "config.yaml"

@@ -8,6 +8,8 @@ from typing import Any
 
 import yaml
 
+from sb3_gac.presets import read_preset
+
 HERE = Path(__file__).parent
 RUNS = HERE / "runs"
 HYPERPARAMS = HERE / "hyperparams"
@@ -26,7 +28,7 @@ class RunSpec:
     :param seed: of everything random
     :param steps: environment steps
     :param envs: environments side by side
-    :param preset: a name in ``hyperparams/presets``, the arguments to start from
+    :param preset: a name in ``sb3_gac/presets``, the arguments to start from
     :param eval_every: environment steps between evaluations
     :param eval_episodes: of each evaluation
     :param overrides: arguments of the algorithm that replace those of the preset
@@ -89,7 +91,7 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
     suite = yaml.safe_load(path.read_text())
     check_is(path.name, suite, "a mapping", Mapping)
     if "preset" in suite:
-        suite = {**read_preset(suite["preset"])["run"], **suite}
+        suite = {**read_preset(suite["preset"]).run, **suite}
     check_keys(path.name, suite, _SUITE_KEYS, _SUITE_KEYS - {"overrides"})
     for key in ("steps", "envs", "eval_every", "eval_episodes"):
         check_is(f"{path.name}, {key}", suite[key], "a whole number above 0", int, lambda number: number > 0)
@@ -122,23 +124,6 @@ def _cells_by_noise(name: str, suite: dict[str, Any], cell: dict[str, Any]) -> I
     for noise in cell["noises"]:
         runs = ((algorithm, seed) for seed in cell["seeds"] for algorithm in cell["algorithms"])
         yield [RunSpec(algorithm, cell["task"], float(noise), seed, **common) for algorithm, seed in runs]
-
-
-def read_preset(name: str) -> dict[str, Any]:
-    """
-    :param name: of a file in ``hyperparams/presets``
-    :return: its ``run`` settings, ``arguments`` and ``tasks``
-    :raises ValueError: if there is no such preset, or it has unknown keys
-    """
-    path = HYPERPARAMS / "presets" / f"{name}.yml"
-    if not path.exists():
-        raise ValueError(f"preset must be one of {sorted(p.stem for p in path.parent.glob('*.yml'))}, got {name!r}.")
-    preset = yaml.safe_load(path.read_text())
-    check_keys(path.name, preset, {"run", "arguments", "tasks"}, {"run", "arguments"})
-    check_keys(f"{path.name}, run", preset["run"], {"envs", "steps"}, set())
-    for task, settings in preset.get("tasks", {}).items():
-        check_keys(f"{path.name}, {task}", settings, {"arguments", "noises"}, set())
-    return preset
 
 
 def check_is(

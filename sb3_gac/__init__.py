@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     from sb3_gac.gac.ablations import GACShare, GACWithoutQ
     from sb3_gac.gac.gac import GAC
     from sb3_gac.gac.policies import GACPolicy
-    from sb3_gac.gac.presets import PRESETS, preset
     from sb3_gac.learner import Learner
+    from sb3_gac.presets import PRESETS, preset
     from sb3_gac.replay.buffer import CompactDictReplayBuffer
     from sb3_gac.replay.episodes import EpisodeReplayBuffer
 
 _WHERE = {
     "GAC": "gac.gac",
-    "PRESETS": "gac.presets",
+    "PRESETS": "presets",
     "AsymmetricSAC": "baselines.asymmetric_sac",
     "CheckpointError": "checkpoint.files",
     "CompactDictReplayBuffer": "replay.buffer",
@@ -52,7 +52,7 @@ _WHERE = {
     "Learner": "learner",
     "SeededEvalCallback": "base.callbacks",
     "export_learner": "deploy.export",
-    "preset": "gac.presets",
+    "preset": "presets",
 }
 
 

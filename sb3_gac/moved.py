@@ -44,6 +44,7 @@ MOVED = {
         "common.training": "base.update",
         "common.vec_state": "checkpoint.vec_env",
         "export": "deploy.export",
+        "gac.presets": "presets",
         "verification": "deploy.verification",
     }.items()
 }

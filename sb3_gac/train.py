@@ -234,7 +234,8 @@ def learn(
     )
     started = time.time()
     if options.resume is None:
-        model, left, before = GAC("MultiInputPolicy", env, seed=options.seed, **gac_arguments(options)), options.steps, 0.0
+        arguments = {"policy": "MultiInputPolicy", **gac_arguments(options)}
+        model, left, before = GAC(env=env, seed=options.seed, **arguments), options.steps, 0.0
     else:
         model = GAC.resume(directory / CHECKPOINTS, env)
         evaluation.history, before = model.resumed_notes["history"], model.resumed_notes["minutes"]
