@@ -14,6 +14,7 @@ import yaml
 from benchmarks.suite import HYPERPARAMS, RunSpec, is_number_as_text
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.envs.suites import SUITES, suite_of, task_of
 from sb3_gac.presets import merge, read_preset
 
 POLICY = "MultiInputPolicy"
@@ -58,10 +59,11 @@ def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
     :return: id and keyword arguments of its environment; without sensor noise there need be no argument for it
     :raises ValueError: if there is no such task
     """
-    ids = {name.removeprefix("sb3_gac/").rpartition("-v")[0]: name for name in gym.registry if name.startswith("sb3_gac/")}
+    ids = {task_of(name): name for name in gym.registry if name.startswith("sb3_gac/")}
     if spec.task not in ids:
         raise ValueError(f"task must be one of the registered sb3_gac/<task>-v<version>, {sorted(ids)}, got {spec.task!r}.")
-    takes_noise = not spec.task.startswith("popgym-")
+    suite = suite_of(ids[spec.task])
+    takes_noise = suite is None or SUITES[suite].sensor_noise
     if spec.noise and not takes_noise:
         raise ValueError(f"{spec.task} has no sensor noise: give noises: [0].")
     return ids[spec.task], {"noise_std": spec.noise} if takes_noise else {}

@@ -30,7 +30,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_gac import GAC, PRESETS, ExactCheckpointCallback, GuiderLearnerEvalCallback, __version__, preset
 from sb3_gac.checkpoint.files import checkpoints
 from sb3_gac.envs import PARTIAL
-from sb3_gac.envs.mujoco import TASKS
+from sb3_gac.envs.suites.mujoco import TASKS
 
 EVAL_SEED = 10_000
 EVALUATIONS = 10

@@ -22,7 +22,7 @@ from typing import Any
 import yaml
 
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class, name_of
-from sb3_gac.envs.mujoco import TASKS
+from sb3_gac.envs.suites import SUITES
 from sb3_gac.presets import merge, read_preset
 
 try:
@@ -48,7 +48,8 @@ def hyperparameters(name: str) -> dict[str, dict[str, Any]]:
     for layer in preset.layers(algorithm_class(name), None, 0.0):
         arguments = merge(arguments, layer)
     default = {key: value for key, value in arguments.items() if key != "role_keys"}
-    return {"default": default, **{f"sb3_gac/{task}-v5": arguments for task in TASKS}}
+    with_whole_state = [env_id for suite in SUITES.values() if suite.sensor_noise for env_id in suite.environments]
+    return {"default": default, **dict.fromkeys(with_whole_state, arguments)}
 
 
 def sample(name: str, trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
