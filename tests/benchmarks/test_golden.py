@@ -34,10 +34,10 @@ import yaml
 from gymnasium import spaces
 
 import benchmarks.aggregate
-import benchmarks.config
 import benchmarks.launch
 import benchmarks.report
 import benchmarks.run
+import benchmarks.suite
 import sb3_gac.presets
 from sb3_gac import GAC, AsymmetricSAC
 
@@ -124,7 +124,7 @@ def made(tmp_path_factory):
     for name, content in (("toy", PRESET), ("algorithms", ALGORITHMS), ("suite", SUITE)):
         (root / f"{name}.yml").write_text(yaml.safe_dump(content))
     with pytest.MonkeyPatch.context() as context:
-        context.setattr(benchmarks.config, "HYPERPARAMS", root)
+        context.setattr(benchmarks.suite, "HYPERPARAMS", root)
         context.setattr(sb3_gac.presets, "DIRECTORY", root)
         context.setattr(benchmarks.launch, "LocalEngine", InThisProcess)
         context.setattr(benchmarks.run, "provenance", lambda: {"commit": "abc", "versions": {}, "cpus": 1})

@@ -23,7 +23,8 @@ import benchmarks.run
 import sb3_gac.presets
 from benchmarks.aggregate import finished_runs, origins
 from benchmarks.checkpoint import SB3Checkpoints, checkpoints_of, locked
-from benchmarks.config import check_runs, environment, read_algorithm, resolve
+from benchmarks.config import check_runs, read_algorithm, resolve
+from benchmarks.environments import environment
 from benchmarks.finished import kind_of, name_of
 from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
@@ -226,15 +227,15 @@ def test_a_failing_run_is_named_with_its_log(tmp_path):
         ({"overrides": [1]}, r"suite.yml, overrides: must be a mapping, got \[1\]"),
         ({"cells": []}, "suite.yml, cells: must be a list of at least one cell"),
         ({"cells": {"task": "Ant"}}, "suite.yml, cells: must be a list"),
-        ({"cells": ["Ant"]}, "suite.yml, a cell: must be a mapping, got 'Ant'"),
-        ({"cells": [CELL | {"seed": 1}]}, r"suite.yml, a cell: unknown keys \['seed'\]"),
-        ({"cells": [CELL | {"seeds": ["0"]}]}, "a cell, seeds: must be whole numbers, each, got '0'"),
-        ({"cells": [CELL | {"seeds": [-1]}]}, "a cell, seeds: must be whole numbers, each, got -1"),
-        ({"cells": [CELL | {"seeds": [0.5]}]}, "a cell, seeds: must be whole numbers, each, got 0.5"),
-        ({"cells": [CELL | {"noises": 0.1}]}, "a cell, noises: must be a list of at least one of numbers, got 0.1"),
-        ({"cells": [CELL | {"noises": ["1e-1"]}]}, "a cell, noises: must be numbers, each, got '1e-1'. YAML reads"),
-        ({"cells": [CELL | {"algorithms": "gac"}]}, "a cell, algorithms: must be a list of at least one of names, got 'gac'"),
-        ({"cells": [CELL | {"algorithms": [1]}]}, "a cell, algorithms: must be names, each, got 1"),
+        ({"cells": ["Ant"]}, "suite.yml, cell 1: must be a mapping, got 'Ant'"),
+        ({"cells": [CELL | {"seed": 1}]}, r"suite.yml, cell 1: unknown keys \['seed'\]"),
+        ({"cells": [CELL | {"seeds": ["0"]}]}, "cell 1, seeds: must be whole numbers, each, got '0'"),
+        ({"cells": [CELL | {"seeds": [-1]}]}, "cell 1, seeds: must be whole numbers, each, got -1"),
+        ({"cells": [CELL | {"seeds": [0.5]}]}, "cell 1, seeds: must be whole numbers, each, got 0.5"),
+        ({"cells": [CELL | {"noises": 0.1}]}, "cell 1, noises: must be a list of at least one of numbers, got 0.1"),
+        ({"cells": [CELL | {"noises": ["1e-1"]}]}, "cell 1, noises: must be numbers, each, got '1e-1'. YAML reads"),
+        ({"cells": [CELL | {"algorithms": "gac"}]}, "cell 1, algorithms: must be a list of at least one of names, got 'gac'"),
+        ({"cells": [CELL | {"algorithms": [1]}]}, "cell 1, algorithms: must be names, each, got 1"),
     ],
 )
 def test_unknown_and_missing_keys_are_refused(tmp_path, change, message):
