@@ -2,6 +2,7 @@
 
 import json
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -236,11 +237,16 @@ def test_what_a_failed_run_was_needed_for_is_not_started_and_says_why(tmp_path, 
     assert "0 were finished before, 1 now, 1 failed, 2 not started." in said
 
 
-def test_jobs_that_wait_leave_their_place_to_others(tmp_path):
-    """With room for two at once, the second is free for what needs nothing."""
+@pytest.fixture
+def three(tmp_path):
+    """Jobs, of which the second needs the first."""
     spec = RunSpec("gac", "Pendulum", 0.1, 0, 60, 2, "small", 20, 1)
     jobs = [Job(spec, tmp_path / name, [name]) for name in ("teacher", "student", "other")]
     jobs[1].needs = [jobs[0]]
+    return jobs
+
+
+def test_jobs_that_wait_leave_their_place_to_others(three):
     started = []
 
     class Engine:
@@ -248,10 +254,25 @@ def test_jobs_that_wait_leave_their_place_to_others(tmp_path):
             started.append(command[0])
             return 0
 
-    launch(jobs, 1, 0, Engine())
+    launch(three, 1, 0, Engine())
     assert started == ["teacher", "other", "student"]
-    jobs[1].state = "not started"
-    assert count(jobs) == "1 not started, 2 finished, 0 running, 0 waiting"
+    three[1].state = "not started"
+    assert count(three) == "1 not started, 2 finished, 0 running, 0 waiting"
+
+
+def test_a_job_waits_until_what_it_needs_has_ended_though_there_is_room(three):
+    started, ended = {name: threading.Event() for name in ("teacher", "student", "other")}, []
+
+    class Engine:
+        def run(self, command, log):
+            started[command[0]].set()
+            if command[0] == "teacher":
+                started["student"].wait(0.5)  # in which it is not to happen
+            ended.append(command[0])
+            return 0
+
+    launch(three, 2, 0, Engine())
+    assert ended == ["other", "teacher", "student"]
 
 
 def test_a_run_by_itself_says_what_it_needs(tmp_path):
