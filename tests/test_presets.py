@@ -108,6 +108,10 @@ def test_names_of_activations_and_optimisers_become_classes():
             "own.yml, Ant: unknown keys ['noise']",
         ),
         (
+            {"run": {"envs": 1}, "arguments": {}, "tasks": {"Ant": {"noises": {"1e-1": {"gac": {}}}}}},
+            "own.yml, Ant, noises: must be numbers, each, got '1e-1'",
+        ),
+        (
             {"run": {"envs": 1}, "arguments": {}, "tasks": {"Ant": {"noises": {0.1: {"gacc": {}}}}}},
             "own.yml, Ant, noise 0.1: unknown keys ['gacc']",
         ),

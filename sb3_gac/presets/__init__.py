@@ -82,6 +82,8 @@ def read_preset(name: str) -> Preset:
         _check(where, settings, {"arguments", "noises"})
         _check_sections(f"{where}, arguments", settings.get("arguments", {}))
         for noise, sections in settings.get("noises", {}).items():
+            if not isinstance(noise, int | float):
+                raise ValueError(f"{where}, noises: must be numbers, each, got {noise!r}.")
             _check_sections(f"{where}, noise {noise}", sections)
     return Preset(path.stem, **content)
 
