@@ -11,7 +11,7 @@ from typing import Any
 from stable_baselines3.common.logger import Logger
 
 from benchmarks.environments import environment, make_envs
-from benchmarks.suite import RunSpec, check_keys, check_numbers, needed_runs, read_definitions
+from benchmarks.suite import RunSpec, check_keys, check_numbers, needed_runs, read_definitions, with_needed
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.presets import instantiate, merge, read_preset
@@ -49,7 +49,7 @@ def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
     :raises ValueError: naming an algorithm, a task or an argument that there is not, a number that YAML reads as text, or what
         an algorithm says of an environment
     """
-    kinds = {(spec.algorithm, spec.cell): spec for spec in _with_needed(specs)}
+    kinds = {(spec.algorithm, spec.cell): spec for spec in with_needed(specs)}
     for spec in kinds.values():
         try:
             environment(spec)
@@ -59,12 +59,6 @@ def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
     for spec in kinds.values():
         if spec.environment is not None:
             try_out(where, spec)
-
-
-def _with_needed(specs: Iterable[RunSpec]) -> Iterable[RunSpec]:
-    for spec in specs:
-        yield from _with_needed(needed_runs(spec).values())
-        yield spec
 
 
 def try_out(where: str, spec: RunSpec) -> None:

@@ -3,7 +3,7 @@
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ _SUITE_KEYS = {*_COMMON, "overrides", "algorithms", "cells"}
 _SHARED_KEYS = {"algorithms", "seeds", "needs"}
 _TASK_KEYS = {"task", "noises", *_SHARED_KEYS}
 _ENV_KEYS = {"env", "env_kwargs", "wrappers", "name", *_SHARED_KEYS}
-_NAME = re.compile(r"[\w.+-]+")
+_NAME = re.compile(r"\w[\w.+-]*")
 _WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # other digits may be in quotes for a reason
 
 
@@ -93,19 +93,23 @@ def needed_runs(spec: RunSpec) -> dict[str, RunSpec]:
     return {argument: replace(spec, **{"definition": None, "needs": None} | need) for argument, need in needs.items()}
 
 
+def with_needed(specs: Iterable[RunSpec]) -> Iterator[RunSpec]:
+    """
+    :param specs: of runs
+    :return: each after those that it needs
+    """
+    for spec in specs:
+        yield from with_needed(needed_runs(spec).values())
+        yield spec
+
+
 def needed_steps(spec: RunSpec) -> int:
     """
     :param spec: of a run
     :return: environment steps of all runs that must come before it, each counted once
     """
-    return sum(_steps_by_directory(spec).values())
-
-
-def _steps_by_directory(spec: RunSpec) -> dict[Path, int]:
-    found: dict[Path, int] = {}
-    for needed in needed_runs(spec).values():
-        found |= {needed.directory(Path()): needed.steps} | _steps_by_directory(needed)
-    return found
+    before = {needed.directory(Path()): needed.steps for needed in with_needed(needed_runs(spec).values())}
+    return sum(before.values())
 
 
 def made_with(configuration: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -156,6 +160,11 @@ def _check_distinct(name: str, specs: list[RunSpec]) -> None:
     count = Counter(str(spec.directory(Path())) for spec in specs)
     if twice := sorted(directory for directory, times in count.items() if times > 1):
         raise ValueError(f"{name} lists these runs more than once: {twice}.")
+    runs: dict[Path, RunSpec] = {}
+    for spec in with_needed(specs):
+        directory = spec.directory(Path())
+        if runs.setdefault(directory, spec) != spec:
+            raise ValueError(f"{name}: {directory} is needed in two ways, that differ in what it needs itself.")
     environments: dict[str, dict[str, Any] | None] = {}
     for spec in specs:
         if environments.setdefault(spec.cell, spec.environment) != spec.environment:
@@ -194,36 +203,42 @@ class _Reader:
     def _by_noise(self, number: int, cell: Any) -> Iterator[list[RunSpec]]:
         where = f"{self._name}, cell {number}"
         check_is(where, cell, "a mapping", Mapping)
-        if "env" in cell:
-            check_keys(where, cell, _ENV_KEYS, {"env", "algorithms", "seeds"})
-            environment: dict[str, Any] | None = read_environment(where, cell)
-            task, noises = cell.get("name", default_name(cell["env"])), [None]
-            check_is(f"{where}, name", task, "a name of letters, digits and . + -", str, _NAME.fullmatch)
-        else:
-            check_keys(where, cell, _TASK_KEYS, _TASK_KEYS - {"needs"})
-            environment, task, noises = None, cell["task"], cell["noises"]
-            _check_list(f"{where}, noises", noises, "numbers", (int, float))
+        environment, task, noises = self._environment(where, cell)
         _check_list(f"{where}, seeds", cell["seeds"], "whole numbers", int)
         _check_list(f"{where}, algorithms", cell["algorithms"], "names", str)
         common = {key: self._suite[key] for key in _COMMON} | {"overrides": self._suite.get("overrides", {})}
+        particulars = self._particulars(where, cell)
+        for noise in noises:
+            yield [
+                RunSpec(name, task, noise, seed, **common, environment=environment, **particulars[name])
+                for seed in cell["seeds"]
+                for name in cell["algorithms"]
+            ]
+
+    def _environment(self, where: str, cell: Any) -> tuple[dict[str, Any] | None, str, list[float | None]]:
+        """One that is no registered task, if it is none; its name, and its noises."""
+        if "env" in cell:
+            check_keys(where, cell, _ENV_KEYS, {"env", "algorithms", "seeds"})
+            environment, name = read_environment(where, cell), cell.get("name", default_name(cell["env"]))
+            check_is(f"{where}, name", name, "a name of letters, digits and . + -", str, _NAME.fullmatch)
+            return environment, name, [None]
+        check_keys(where, cell, _TASK_KEYS, _TASK_KEYS - {"needs"})
+        _check_list(f"{where}, noises", cell["noises"], "numbers", (int, float))
+        return None, cell["task"], [float(noise) for noise in cell["noises"]]
+
+    def _particulars(self, where: str, cell: Any) -> dict[str, dict[str, Any]]:
+        """Each algorithm's definition, if it is the suite's, and what it needs."""
         changes = cell.get("needs", {})
         check_is(f"{where}, needs", changes, "a mapping", Mapping)
         if unknown := sorted(set(changes) - set(cell["algorithms"])):
             raise ValueError(f"{where}, needs: the cell has no algorithms {unknown}; it has {cell['algorithms']}.")
-        of_algorithm = {
+        return {
             name: {
                 "definition": self._own.get(name),
                 "needs": self._needs(f"{where}, {name}", name, self._suite["steps"], changes.get(name, {})),
             }
             for name in cell["algorithms"]
         }
-        for noise in noises:
-            level = None if noise is None else float(noise)
-            yield [
-                RunSpec(name, task, level, seed, **common, environment=environment, **of_algorithm[name])
-                for seed in cell["seeds"]
-                for name in cell["algorithms"]
-            ]
 
     def _needs(
         self, where: str, name: str, steps: int, changes: Mapping[str, Any], above: tuple[str, ...] = ()

@@ -172,6 +172,7 @@ def test_from_suite_to_report_beside_a_task_with_noise(suite, tmp_path, monkeypa
         ({"noises": [0.1]}, r"own.yml, cell 1: unknown keys \['noises'\]"),
         ({"env": 3}, "own.yml, cell 1, env: must be an id.*got 3"),
         ({"name": "a/b"}, "own.yml, cell 1, name: must be a name of letters.*got 'a/b'"),
+        ({"name": ".."}, "own.yml, cell 1, name: must be a name of letters.*got '..'"),
         ({"name": ""}, "own.yml, cell 1, name: must be"),
         ({"env_kwargs": [1]}, r"own.yml, cell 1, env_kwargs: must be a mapping of keyword arguments, got \[1\]"),
         ({"env_kwargs": {1: 2}}, "own.yml, cell 1, env_kwargs: must be"),

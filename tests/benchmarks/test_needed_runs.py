@@ -312,6 +312,13 @@ def test_needs_that_mean_nothing_are_refused(tmp_path, needs, message):
         jobs_left(_suite(tmp_path, CELL, algorithms=own), tmp_path)
 
 
+def test_a_run_that_would_be_needed_in_two_ways_is_refused(tmp_path):
+    changed = {"needs": {"taught": {"teacher": {"steps": 20}}}}
+    path = _suite(tmp_path, CELL | {"algorithms": ["taught", "twice"]} | changed, steps=30)
+    with pytest.raises(ValueError, match=r"taught.yml: small-30/Pendulum-noise0.1/taught/seed0 is needed in two ways"):
+        read_suite(path)
+
+
 def test_a_cell_changes_the_needs_of_its_own_algorithms_alone(tmp_path):
     with pytest.raises(ValueError, match=r"cell 1, needs: the cell has no algorithms \['twice'\]; it has \['taught'\]"):
         read_suite(_suite(tmp_path, CELL | {"needs": {"twice": {"teacher": {"steps": 20}}}}))
