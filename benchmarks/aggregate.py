@@ -22,15 +22,20 @@ from rliable import metrics
 
 from benchmarks.finished import (
     NAMES,
+    NEEDED,
+    NO_NOISE,
     FinishedRun,
     add_earlier_options,
     kind_of,
     name_of,
+    names_of,
+    particulars_of,
     read_directory,
     read_earlier,
+    read_tidy,
     settings_of,
 )
-from benchmarks.suite import HERE, RUNS, read_cells
+from benchmarks.suite import HERE, RUNS, needed_steps, read_cells
 
 CELL = ["task", "noise"]
 REFERENCE = "sac-asym"
@@ -66,9 +71,12 @@ def finished_runs(
 def collect(runs: list[FinishedRun]) -> pd.DataFrame:
     """
     :param runs: finished
-    :return: one row per evaluation: task, noise, algorithm, seed, timesteps, learner, and guider, kl, ... where there are
+    :return: one row per evaluation: task, noise, algorithm, seed, timesteps, learner, and guider, kl, ... where there are;
+        ``needed_steps``, if a run needs others, are those of the runs that came before, and not among its timesteps
     """
-    frames = [run.evaluations.assign(**{name: getattr(run.spec, name) for name in NAMES}) for run in runs]
+    before = {run.name: needed_steps(run.spec) for run in runs}
+    of_needed = {name: {NEEDED: steps} if any(before.values()) else {} for name, steps in before.items()}
+    frames = [run.evaluations.assign(**names_of(run.spec), **of_needed[run.name]) for run in runs]
     tidy = pd.concat(frames, ignore_index=True)
     return tidy[[*NAMES, *(column for column in tidy.columns if column not in NAMES)]]
 
@@ -109,8 +117,9 @@ def summarise_cells(tidy: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
             own = scores[scores.algorithm == algorithm].sort_values("seed")
             rows.append(
                 {
-                    **dict(zip(CELL, cell_key, strict=True)),
+                    **_named(cell_key),
                     "algorithm": algorithm,
+                    **({NEEDED: steps_before(group)} if steps_before(group) else {}),
                     "seeds": own.seed.tolist(),
                     "final": own.final.round(1).tolist(),
                     "final_mean": round(float(own.final.mean()), 1),
@@ -121,6 +130,19 @@ def summarise_cells(tidy: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
                 }
             )
     return rows
+
+
+def _named(cell_key: Any) -> dict[str, Any]:
+    task, noise = cell_key
+    return {"task": task, "noise": None if noise == NO_NOISE else noise}
+
+
+def steps_before(group: pd.DataFrame) -> int:
+    """
+    :param group: one algorithm in one cell
+    :return: environment steps of the runs that one of its runs needs
+    """
+    return int(group[NEEDED].max()) if NEEDED in group else 0
 
 
 def interval(scores: np.ndarray) -> list[float]:
@@ -136,11 +158,12 @@ def steps_to(group: pd.DataFrame, threshold: float) -> int | None:
     """
     :param group: one algorithm in one cell
     :param threshold: a return
-    :return: environment steps at the first evaluation where the mean over seeds reaches it, ``None`` if none does
+    :return: environment steps, with those of needed runs, at the first evaluation where the mean over seeds reaches it,
+        ``None`` if none does
     """
     mean = group.groupby("timesteps").learner.mean()
     reached = mean.index[mean >= threshold]
-    return int(reached[0]) if len(reached) else None
+    return int(reached[0]) + steps_before(group) if len(reached) else None
 
 
 def guidance(group: pd.DataFrame) -> dict[str, float]:
@@ -213,7 +236,7 @@ def _compared_cells(compared: pd.DataFrame) -> list[dict[str, Any]]:
     """Each cell's seeds by algorithm, and the returns that count as 0 and 1."""
     return [
         {
-            **dict(zip(CELL, key, strict=True)),
+            **_named(key),
             "low": round(float(cell.low.iloc[0]), 3),
             "high": round(float(cell.high.iloc[0]), 3),
             "seeds": {str(name): group.seed.tolist() for name, group in cell.groupby("algorithm", sort=False)},
@@ -268,6 +291,7 @@ def origins(runs: list[FinishedRun]) -> dict[str, Any]:
     """Commits and versions of the runs, their settings and arguments, and the hours that they took."""
     made_with = _distinct([origin for run in runs for origin in run.origins])
     seconds = [run.seconds for run in runs if run.seconds is not None]
+    particulars = {kind_of(run.spec): found for run in runs if (found := particulars_of(run.spec))}
     return {
         "made_with": made_with,
         "mixed_runs": [run.name for run in runs if len(run.origins) > 1],
@@ -277,6 +301,7 @@ def origins(runs: list[FinishedRun]) -> dict[str, Any]:
         "seconds_per_run": {"median": round(float(np.median(seconds)), 1), "max": round(max(seconds), 1)} if seconds else {},
         "settings": settings_of(runs[0].spec),
         "arguments": {kind_of(run.spec): run.arguments for run in runs},
+        **({"particulars": particulars} if particulars else {}),
         "runs": {
             run.name: {"seconds": run.seconds, "made_with": [made_with.index(origin) for origin in run.origins]}
             for run in runs
@@ -301,8 +326,9 @@ def main() -> None:
     runs, missing = finished_runs(options.suite, options.runs, options.complete_cells, options.earlier, options.renewed)
     evaluations = options.out.with_suffix(".csv")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    collect(runs).to_csv(evaluations, index=False, float_format="%.6g")
-    tidy = pd.read_csv(evaluations, dtype={"noise": float})  # so that the scores follow from the file to the last digit
+    table = collect(runs).replace({"noise": {NO_NOISE: np.nan}})
+    table.to_csv(evaluations, index=False, float_format="%.6g")
+    tidy = read_tidy(evaluations)  # so that the scores follow from the file to the last digit
     reference = choose_reference(list(tidy.algorithm.unique()), options.reference)
     results = {
         "command": command(options),

@@ -5,71 +5,85 @@ In order: the preset's arguments, those of the task, those of the task at that n
 for the classes from which the algorithm descends), the suite's overrides, the algorithm's own.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-import gymnasium as gym
-import torch as th
-import yaml
-from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
 
-import sb3_gac
-from benchmarks.suite import HYPERPARAMS, RunSpec, check_keys, is_number_as_text, read_preset
+from benchmarks.environments import environment, make_envs
+from benchmarks.suite import RunSpec, check_keys, check_numbers, needed_runs, read_definitions, with_needed
+from sb3_gac.algorithms import algorithm_class
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.presets import instantiate, merge, read_preset
 
-_OTHERS_CLASSES = {"stable_baselines3.SAC": SAC}
 POLICY = "MultiInputPolicy"
 _GIVEN_TO_POLICIES = {"observation_space", "action_space", "lr_schedule"}
-_LIBRARIES = {"activation_fn": th.nn, "optimizer_class": th.optim}
 
 
-def read_algorithm(name: str) -> tuple[type, dict[str, Any]]:
+def read_algorithm(name: str, definition: Mapping[str, Any] | None = None) -> tuple[type, dict[str, Any]]:
     """
-    :param name: of an algorithm in ``hyperparams/algorithms.yml``
+    :param name: of an algorithm
+    :param definition: of it, ``None`` for that in ``hyperparams/algorithms.yml``
     :return: its class, and its arguments
     :raises ValueError: if there is no such algorithm or class
     """
-    algorithms = yaml.safe_load((HYPERPARAMS / "algorithms.yml").read_text())
-    if name not in algorithms:
-        raise ValueError(f"algorithm must be one of {sorted(algorithms)}, got {name!r}.")
-    arguments = dict(algorithms[name])
-    class_name = arguments.pop("class")
-    if class_name in _OTHERS_CLASSES:
-        return _OTHERS_CLASSES[class_name], arguments
-    if class_name not in sb3_gac.__all__:
-        raise ValueError(f"Algorithm {name} names the class {class_name!r}, which neither sb3_gac nor {_OTHERS_CLASSES} has.")
-    return getattr(sb3_gac, class_name), arguments
+    if definition is None:
+        definitions = read_definitions()
+        if name not in definitions:
+            raise ValueError(f"algorithm must be one of {sorted(definitions)}, got {name!r}.")
+        definition = definitions[name]
+    check_keys(f"algorithm {name}", definition, {"class", *definition}, {"class"})
+    try:
+        kind = algorithm_class(str(definition["class"]))
+    except ValueError as error:
+        raise ValueError(f"algorithm {name}, class: {error}") from None
+    return kind, {key: value for key, value in definition.items() if key not in ("class", "needs")}
 
 
 def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
     """
-    Whether runs can be made, as far as can be told without making one.
+    Whether runs can be made, as far as can be told at once. Environments that are no registered tasks are tried out.
 
     :param where: the suite, for the message
     :param specs: of its runs
-    :raises ValueError: naming an algorithm, a task or an argument that there is not, or a number that YAML reads as text
+    :raises ValueError: naming an algorithm, a task or an argument that there is not, a number that YAML reads as text, or what
+        an algorithm says of an environment
     """
-    for spec in {(spec.algorithm, spec.task, spec.noise): spec for spec in specs}.values():
+    kinds = {(spec.algorithm, spec.cell): spec for spec in with_needed(specs)}
+    for spec in kinds.values():
         try:
             environment(spec)
             resolve(spec)
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
+    for spec in kinds.values():
+        if spec.environment is not None:
+            try_out(where, spec)
 
 
-def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
+def try_out(where: str, spec: RunSpec) -> None:
     """
+    Make a run's environment, and on it, unless it needs another run first, its algorithm, which takes one step.
+
+    :param where: the suite, for the message
     :param spec: of a run
-    :return: id and keyword arguments of its environment; without sensor noise there need be no argument for it
-    :raises ValueError: if there is no such task
+    :raises ValueError: with what went wrong
     """
-    ids = {name.removeprefix("sb3_gac/").rpartition("-v")[0]: name for name in gym.registry if name.startswith("sb3_gac/")}
-    if spec.task not in ids:
-        raise ValueError(f"task must be one of the registered sb3_gac/<task>-v<version>, {sorted(ids)}, got {spec.task!r}.")
-    takes_noise = not spec.task.startswith("popgym-")
-    if spec.noise and not takes_noise:
-        raise ValueError(f"{spec.task} has no sensor noise: give noises: [0].")
-    return ids[spec.task], {"noise_std": spec.noise} if takes_noise else {}
+    try:
+        env = make_envs(spec, min(spec.envs, 2), spec.seed)
+        try:
+            if spec.needs is None:
+                kind, arguments = resolve(spec)
+                small = {"buffer_size": 1_000, "learning_starts": 10**9}
+                known = constructor_parameters(kind)
+                arguments |= {name: value for name, value in small.items() if name in known}
+                model = kind(env=env, device="cpu", **{"policy": POLICY, **instantiate(arguments), "seed": spec.seed})
+                model.set_logger(Logger(None, []))
+                model.learn(1)
+        finally:
+            env.close()
+    except Exception as error:
+        raise ValueError(f"{where}, {spec.cell}, {spec.algorithm}: {type(error).__name__}: {error}") from error
 
 
 def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
@@ -78,18 +92,25 @@ def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
     :return: class of the algorithm, and its arguments, as YAML has them
     :raises ValueError: if an argument is unknown to the class or its policy, or is a number that YAML reads as text
     """
-    algorithm_class, own = read_algorithm(spec.algorithm)
-    resolved: dict[str, Any] = {"buffer_size": min(1_000_000, max(spec.steps, 1_000))}
-    for layer in (*_preset_layers(spec, algorithm_class), spec.overrides, own):
+    kind, own = read_algorithm(spec.algorithm, spec.definition)
+    preset = read_preset(spec.preset)
+    task = spec.task if spec.environment is None else None
+    resolved: dict[str, Any] = {}
+    if "buffer_size" in constructor_parameters(kind):
+        resolved["buffer_size"] = min(1_000_000, max(spec.steps, 1_000))
+    for layer in (*preset.layers(kind, task, spec.noise or 0.0), spec.overrides, own):
         resolved = merge(resolved, layer)
-    _check_known(spec.algorithm, resolved, algorithm_class, {"env"})
-    policies, policy = algorithm_class.policy_aliases, resolved.get("policy", POLICY)  # type: ignore[attr-defined]
+    needed = needed_runs(spec)
+    if both := sorted(set(needed) & set(resolved)):
+        raise ValueError(f"{spec.algorithm}: {both} are what it needs, and among its arguments too.")
+    _check_known(spec.algorithm, {**resolved, **needed}, kind, {"env"})
+    policies, policy = kind.policy_aliases, resolved.get("policy", POLICY)  # type: ignore[attr-defined]
     if policy not in policies:
         raise ValueError(f"{spec.algorithm}: policy must be one of {sorted(policies)}, got {policy!r}.")
     of_policy = resolved.get("policy_kwargs") or {}
     _check_known(f"{spec.algorithm}, policy_kwargs", of_policy, policies[policy], _GIVEN_TO_POLICIES)
-    _check_numbers(spec.algorithm, resolved)
-    return algorithm_class, resolved
+    check_numbers(spec.algorithm, resolved)
+    return kind, resolved
 
 
 def _check_known(where: str, arguments: Mapping[str, Any], taker: type, given: set[str]) -> None:
@@ -97,50 +118,3 @@ def _check_known(where: str, arguments: Mapping[str, Any], taker: type, given: s
     unknown = sorted(set(arguments) - set(known))
     if unknown:
         raise ValueError(f"{where}: {taker.__name__} has no arguments {unknown}; it has {known}.")
-
-
-def _check_numbers(where: str, value: Any) -> None:
-    """In arguments, and in whatever they hold."""
-    if is_number_as_text(value):
-        raise ValueError(f"{where}: YAML reads {value!r} as text: a number has a decimal point before its e, as in 1.0e-3.")
-    pairs = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
-    for key, inner in pairs:
-        _check_numbers(f"{where}, {key}", inner)
-
-
-def _preset_layers(spec: RunSpec, algorithm_class: type) -> Iterator[Mapping[str, Any]]:
-    preset = read_preset(spec.preset)
-    task = preset.get("tasks", {}).get(spec.task, {})
-    noises = {float(noise): layer for noise, layer in task.get("noises", {}).items()}
-    families = ["all", *(ancestor.__name__ for ancestor in reversed(algorithm_class.__mro__))]
-    for arguments in (preset["arguments"], task.get("arguments", {}), noises.get(spec.noise, {})):
-        check_keys(f"preset {spec.preset}, arguments", arguments, {"all", *sb3_gac.__all__}, set())
-        yield from (arguments[family] for family in families if family in arguments)
-
-
-def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    :param below: a layer
-    :param above: what replaces it, key by key; mappings are merged
-    """
-    merged = dict(below)
-    for key, value in above.items():
-        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
-        merged[key] = merge(merged[key], value) if both and key == "policy_kwargs" else value
-    return merged
-
-
-def instantiate(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    :param arguments: as YAML has them
-    :return: as the class takes them: names of activations and optimisers become classes
-    :raises ValueError: if torch has none of that name
-    """
-    policy_kwargs = dict(arguments.get("policy_kwargs") or {})
-    for key, library in _LIBRARIES.items():
-        if key in policy_kwargs:
-            found = getattr(library, str(policy_kwargs[key]), None)
-            if not isinstance(found, type):
-                raise ValueError(f"policy_kwargs: {key} must name a class of {library.__name__}, got {policy_kwargs[key]!r}.")
-            policy_kwargs[key] = found
-    return {**arguments, "policy_kwargs": policy_kwargs}

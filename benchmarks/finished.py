@@ -15,6 +15,11 @@ from benchmarks.suite import RunSpec, made_with
 
 #: What tells a suite's runs apart
 NAMES = ["task", "noise", "algorithm", "seed"]
+#: In the place of a noise, for environments that are not asked for one; an empty field in files
+NO_NOISE = -1.0
+#: Environment steps of the runs that a run needs
+NEEDED = "needed_steps"
+_PARTICULARS = ["environment", "definition", "needs"]
 
 
 class FinishedRun(NamedTuple):
@@ -55,7 +60,31 @@ def kind_of(spec: RunSpec) -> str:
     :param spec: of a run
     :return: what runs with the same arguments have in common
     """
-    return f"{spec.algorithm}, {spec.task}, noise {spec.noise:g}"
+    return f"{spec.algorithm}, {spec.task}" + ("" if spec.noise is None else f", noise {spec.noise:g}")
+
+
+def names_of(spec: RunSpec) -> dict[str, Any]:
+    """
+    :param spec: of a run
+    :return: ``NAMES`` -> what a table has there
+    """
+    return {name: getattr(spec, name) for name in NAMES} | {"noise": NO_NOISE if spec.noise is None else spec.noise}
+
+
+def particulars_of(spec: RunSpec) -> dict[str, Any]:
+    """
+    :param spec: of a run
+    :return: what not all runs of its suite have: an environment that is no registered task, a definition, needs
+    """
+    return {name: value for name, value in asdict(spec).items() if name in _PARTICULARS and value is not None}
+
+
+def read_tidy(path: Path) -> pd.DataFrame:
+    """
+    :param path: of an aggregated CSV
+    :return: its rows
+    """
+    return pd.read_csv(path, dtype={"noise": float}).fillna({"noise": NO_NOISE})
 
 
 def settings_of(spec: RunSpec) -> dict[str, Any]:
@@ -63,7 +92,7 @@ def settings_of(spec: RunSpec) -> dict[str, Any]:
     :param spec: of a run
     :return: what all runs of its suite have in common
     """
-    return {name: value for name, value in asdict(spec).items() if name not in NAMES}
+    return {name: value for name, value in asdict(spec).items() if name not in [*NAMES, *_PARTICULARS]}
 
 
 def read_directory(spec: RunSpec, runs: Path) -> FinishedRun:
@@ -114,8 +143,7 @@ def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]
     results = json.loads(path.with_suffix(".json").read_text())
     if "runs" not in results:
         raise ValueError(f"{path}.json does not tell its runs apart: it was aggregated before they could be taken up again.")
-    tidy = pd.read_csv(path.with_suffix(".csv"), dtype={"noise": float})
-    evaluations = dict(list(tidy.groupby(NAMES)))
+    evaluations = dict(list(read_tidy(path.with_suffix(".csv")).drop(columns=NEEDED, errors="ignore").groupby(NAMES)))
     return {name_of(spec): _recorded(spec, results, evaluations) for spec in specs if _is_among(results, spec)}
 
 
@@ -124,11 +152,12 @@ def _is_among(results: Mapping[str, Any], spec: RunSpec) -> bool:
         name_of(spec) in results["runs"]
         and results["settings"] == settings_of(spec)
         and results["arguments"][kind_of(spec)] == resolve(spec)[1]
+        and results.get("particulars", {}).get(kind_of(spec), {}) == particulars_of(spec)
     )
 
 
 def _recorded(spec: RunSpec, results: Mapping[str, Any], evaluations: Mapping[Any, pd.DataFrame]) -> FinishedRun:
     of_run = results["runs"][name_of(spec)]
-    rows = evaluations[tuple(getattr(spec, name) for name in NAMES)].drop(columns=NAMES).dropna(axis=1, how="all")
+    rows = evaluations[tuple(names_of(spec).values())].drop(columns=NAMES).dropna(axis=1, how="all")
     origins = [results["made_with"][index] for index in of_run["made_with"]]
     return FinishedRun(spec, rows, results["arguments"][kind_of(spec)], origins, of_run["seconds"], results["cpus"])

@@ -5,7 +5,8 @@ A suite -> its runs, several side by side with one thread each::
 
 Finished runs are skipped and unfinished ones go on from their checkpoints, so an interrupted launch is resumed by the same
 command; runs whose directories are elsewhere, or gone, count as finished if ``--earlier`` results have them.  A failed run is
-tried again.  ``--dry-run`` prints the commands of what is left to do.  ``--engine ray`` runs on a Ray cluster whose nodes
+tried again.  What a run needs another run's model for comes first, once for all that need it; where that fails, they are not
+started.  ``--dry-run`` prints the commands of what is left to do.  ``--engine ray`` runs on a Ray cluster whose nodes
 share this checkout, its Python and the runs' directory.
 """
 
@@ -15,10 +16,10 @@ import os
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -30,10 +31,12 @@ from rich.text import Text
 from benchmarks.config import check_runs
 from benchmarks.engines import Engine, LocalEngine, RayEngine
 from benchmarks.finished import add_earlier_options, name_of, read_earlier
-from benchmarks.suite import RUNS, RunSpec, read_suite
+from benchmarks.run import model_of
+from benchmarks.suite import RUNS, RunSpec, needed_runs, read_suite
 
 COLUMNS = ("task", "noise", "algorithm", "seed", "state", "steps", "return")
-STATES = ("waiting", "running", "finished", "failed")
+STATES = ("waiting", "running", "finished", "not started", "failed")
+_ENDED_BADLY = ("not started", "failed")
 _FRAME = 6  # lines that are no runs: borders, names of columns, how many there are, and one of the terminal's own
 
 
@@ -46,12 +49,24 @@ class Job:
     :param directory: of the run
     :param command: to run it
     :param state: one of ``STATES``
+    :param needs: jobs that must be finished before
     """
 
     spec: RunSpec
     directory: Path
     command: list[str]
     state: str = "waiting"
+    needs: list["Job"] = field(default_factory=list)
+
+    @property
+    def lacking(self) -> list["Job"]:
+        """Those that it needs, and that will never be finished."""
+        return [job for job in self.needs if job.state in _ENDED_BADLY]
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether nothing that it needs is still to come."""
+        return all(job.state not in ("waiting", "running") for job in self.needs)
 
     @property
     def log(self) -> Path:
@@ -65,20 +80,50 @@ def jobs_left(suite: Path, runs: Path, earlier: Sequence[Path] = (), renewed: Se
     :param runs: directory of all runs
     :param earlier: results, without a suffix, whose runs are finished too
     :param renewed: algorithms of which they are not
-    :return: the runs that are not finished, and how many are
+    :return: the runs that are not finished, those first that others need; and how many of the suite's are finished
     :raises ValueError: naming what is wrong with the suite
     """
     specs = read_suite(suite)
     check_runs(suite.name, specs)
     made = read_earlier(earlier, specs, renewed)
     left = [(index, spec) for index, spec in enumerate(specs) if not spec.is_finished(runs) and name_of(spec) not in made]
-    jobs = [Job(spec, spec.directory(runs), run_command(suite, index, runs)) for index, spec in left]
-    return jobs, len(specs) - len(left)
+    jobs: dict[str, Job] = {}
+    for index, spec in left:
+        _add_job(jobs, spec, partial(run_command, suite, index, runs), runs)
+    needed = {name_of(other.spec) for job in jobs.values() for other in job.needs}
+    return sorted(jobs.values(), key=lambda job: name_of(job.spec) not in needed), len(specs) - len(left)
 
 
-def run_command(suite: Path, index: int, runs: Path) -> list[str]:
-    """The exact command of one run."""
-    return [sys.executable, "-m", "benchmarks.run", "--suite", str(suite), "--index", str(index), "--runs", str(runs)]
+def _add_job(
+    jobs: dict[str, Job], spec: RunSpec, command: Callable[..., list[str]], runs: Path, needed: tuple[str, ...] = ()
+) -> Job:
+    """
+    :param jobs: by name, to which the run and those that it needs are added, unless they are there
+    :param spec: of the run
+    :param command: of a run of the suite, or, with names of arguments, of what it needs
+    :param runs: directory of all runs
+    :param needed: from a run of the suite to this one
+    :return: the run's job
+    """
+    name = name_of(spec)
+    if name not in jobs:
+        needs = [
+            _add_job(jobs, other, command, runs, (*needed, argument))
+            for argument, other in needed_runs(spec).items()
+            if not _has_model(other, runs)
+        ]
+        jobs[name] = Job(spec, spec.directory(runs), command(needed), needs=needs)
+    return jobs[name]
+
+
+def _has_model(spec: RunSpec, runs: Path) -> bool:
+    return spec.is_finished(runs) and model_of(spec, runs).exists()
+
+
+def run_command(suite: Path, index: int, runs: Path, needed: Sequence[str] = ()) -> list[str]:
+    """The exact command of one run, or of one that it needs."""
+    command = [sys.executable, "-m", "benchmarks.run", "--suite", str(suite), "--index", str(index), "--runs", str(runs)]
+    return [*command, *(["--needed", *needed] if needed else [])]
 
 
 def launch_one(job: Job, retries: int, engine: Engine, tell: Callable[[Job], None]) -> None:
@@ -114,7 +159,7 @@ def count(jobs: Sequence[Job]) -> str:
     :return: how many are in each state
     """
     states = Counter(job.state for job in jobs)
-    return ", ".join(f"{states[state]} {state}" for state in reversed(STATES) if states[state] or state != "failed")
+    return ", ".join(f"{states[state]} {state}" for state in reversed(STATES) if states[state] or state not in _ENDED_BADLY)
 
 
 class Overview:
@@ -136,7 +181,8 @@ class Overview:
             column.no_wrap = True
         for job in shown:
             spec = job.spec
-            result.add_row(spec.task, f"{spec.noise:g}", spec.algorithm, str(spec.seed), job.state, *progress(job))
+            noise = "" if spec.noise is None else f"{spec.noise:g}"
+            result.add_row(spec.task, noise, spec.algorithm, str(spec.seed), job.state, *progress(job))
         yield result
         hidden = sum(job.state != "waiting" for job in self._jobs) - len(shown)
         yield Text(count(self._jobs) + (f"; {hidden} of them not shown" if hidden else ""), no_wrap=True, overflow="ellipsis")
@@ -146,7 +192,7 @@ class Overview:
         :param rows: that there are
         :return: the jobs in them, the most important ones last
         """
-        jobs = [job for state in ("finished", "failed", "running") for job in self._jobs if job.state == state]
+        jobs = [job for state in ("finished", *_ENDED_BADLY, "running") for job in self._jobs if job.state == state]
         return jobs[-rows:]
 
 
@@ -167,7 +213,13 @@ def print_line(jobs: Sequence[Job], job: Job) -> None:
     """
     steps, value = progress(job) if job.state != "running" else ("", "")
     reached = f", {steps} steps, return {value}" if steps else ""
-    print(f"{name_of(job.spec)}: {job.state}{reached} ({count(jobs)})", flush=True)
+    print(f"{name_of(job.spec)}: {job.state}{reached}{_reason(job)} ({count(jobs)})", flush=True)
+
+
+def _reason(job: Job) -> str:
+    """Why a job was not started."""
+    verbs = {"failed": "failed", "not started": "was not started"}
+    return "".join(f", for it needs {name_of(other.spec)}, which {verbs[other.state]}" for other in job.lacking)
 
 
 def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine) -> None:
@@ -182,14 +234,40 @@ def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine) -> None:
     console = Console()
     tell = (lambda job: None) if console.is_terminal else partial(print_line, jobs)
     with ThreadPoolExecutor(at_once) as pool:
-        futures = [pool.submit(launch_one, job, retries, engine, tell) for job in jobs]
         try:
             with Live(table(jobs), console=console, refresh_per_second=1) if console.is_terminal else nullcontext():
-                for future in futures:
+                for future in in_order(jobs, lambda job: pool.submit(launch_one, job, retries, engine, tell), tell):
                     future.result()
         except KeyboardInterrupt:
             print("Stopped. The same command goes on from the runs' checkpoints.", flush=True)
             os._exit(130)  # a pool would first start and wait for all that is left
+
+
+def in_order(
+    jobs: Sequence[Job], submit: Callable[[Job], "Future[None]"], tell: Callable[[Job], None]
+) -> Iterator["Future[None]"]:
+    """
+    Each job when all that it needs has ended; not at all, if that did not end well.
+
+    :param jobs: to run
+    :param submit: starts a job as soon as there is room for it
+    :param tell: called when a job's state has changed to "not started"
+    :return: the futures of those that were submitted, as they end
+    """
+    left = list(jobs)
+    running: set[Future[None]] = set()
+    while left or running:
+        ready = [job for job in left if job.is_ready]
+        left = [job for job in left if not job.is_ready]
+        for job in ready:
+            if job.lacking:
+                job.state = "not started"
+                tell(job)
+            else:
+                running.add(submit(job))
+        if running:
+            ended, running = wait(running, return_when=FIRST_COMPLETED)
+            yield from ended
 
 
 def main() -> None:
@@ -213,11 +291,15 @@ def main() -> None:
         return
     engine = LocalEngine() if options.engine == "local" else RayEngine(options.address)
     launch(jobs, options.jobs or engine.cpus, options.retries, engine)
-    failed = [job for job in jobs if job.state == "failed"]
+    failed, not_started = ([job for job in jobs if job.state == state] for state in ("failed", "not started"))
     for job in failed:
         print(f"{job.directory}: FAILED, see {job.log}")
-    print(f"{finished} were finished before, {len(jobs) - len(failed)} now, {len(failed)} failed.")
-    sys.exit(bool(failed))
+    for job in not_started:
+        print(f"{job.directory}: NOT STARTED{_reason(job)}")
+    now = len(jobs) - len(failed) - len(not_started)
+    more = f", {len(not_started)} not started" if not_started else ""
+    print(f"{finished} were finished before, {now} now, {len(failed)} failed{more}.")
+    sys.exit(bool(failed or not_started))
 
 
 if __name__ == "__main__":

@@ -25,6 +25,9 @@ from matplotlib import pyplot as plt
 
 COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#7f7f7f")
 STEPS, RETURN, NOT_RUN = "environment steps", "return", "not run yet"
+WITH_NEEDED = "environment steps, with those of needed runs"
+NO_NOISE = -1.0  # in the place of a noise, for environments that are not asked for one
+NEEDED = "needed_steps"
 _SHOWN_ELSEWHERE = ("cells", "normalised_iqm", "probability_of_improvement", "runs")
 STYLE = """
 body {font: 15px sans-serif; margin: 2em}
@@ -42,6 +45,46 @@ def curves(group: pd.DataFrame, column: str = "learner") -> pd.DataFrame:
     by_step = group.groupby("timesteps")[column]
     error = 1.96 * by_step.std(ddof=1).fillna(0.0) / np.sqrt(by_step.count())
     return pd.DataFrame({"mean": by_step.mean(), "low": by_step.mean() - error, "high": by_step.mean() + error})
+
+
+def read_tidy(path: Path, own_steps: bool = False) -> pd.DataFrame:
+    """
+    :param path: of an aggregated CSV
+    :param own_steps: whether a run's steps are counted from its own start, not from that of the first run that it needs
+    :return: its rows
+    """
+    tidy = pd.read_csv(path).fillna({"noise": NO_NOISE})
+    if own_steps or NEEDED not in tidy:
+        return tidy.drop(columns=NEEDED, errors="ignore")
+    return tidy.assign(timesteps=tidy.timesteps + tidy[NEEDED])
+
+
+def steps_label(tidy: pd.DataFrame) -> str:
+    """
+    :param tidy: see :func:`read_tidy`
+    :return: what its timesteps are
+    """
+    return WITH_NEEDED if NEEDED in tidy else STEPS
+
+
+def title_of(task: str, noise: float) -> str:
+    """
+    :param task: of a cell
+    :param noise: of a cell
+    :return: the cell's title
+    """
+    return task if noise == NO_NOISE else f"{task}, noise {noise:g}"
+
+
+def is_wanted(tidy: pd.DataFrame, task: str, noise: float) -> bool:
+    """
+    :param tidy: as aggregated
+    :param task: of a cell
+    :param noise: of a cell
+    :return: whether there is, or could be, such a cell: tasks with a noise and tasks without one share a figure
+    """
+    without = (tidy[tidy.task == task].noise == NO_NOISE).unique()
+    return (noise == NO_NOISE) in without
 
 
 def grid(tidy: pd.DataFrame) -> tuple[list[str], list[float], list[str]]:
@@ -91,10 +134,11 @@ def draw(tidy: pd.DataFrame, path: Path) -> None:
                 if has_guider(group):
                     guider = curves(group, "guider")
                     axis.plot(guider.index, guider["mean"], color=color, linestyle="--", linewidth=1)
-            axis.set(title=f"{task}, noise {noise:g}", xlabel=STEPS, ylabel=RETURN)
+            wanted = is_wanted(tidy, task, noise)
+            axis.set(title=title_of(task, noise) if wanted else "", xlabel=steps_label(tidy), ylabel=RETURN)
             if cell.empty:
                 axis.set_axis_off()
-                axis.text(0.5, 0.5, NOT_RUN, ha="center", transform=axis.transAxes)
+                axis.text(0.5, 0.5, NOT_RUN if wanted else "", ha="center", transform=axis.transAxes)
     shown = next(axis for axis in axes.flat if axis.get_legend_handles_labels()[0])
     shown.legend(fontsize="small")
     figure.savefig(path, dpi=110)
@@ -107,10 +151,11 @@ def interactive(tidy: pd.DataFrame) -> graph_objects.Figure:
     :return: the same grid, with each seed's curve; a click on a name switches an algorithm off in all cells
     """
     tasks, noises, algorithms = grid(tidy)
-    titles = [f"{task}, noise {noise:g}" for noise in noises for task in tasks]
+    wanted = {(task, noise): is_wanted(tidy, task, noise) for noise in noises for task in tasks}
+    titles = [title_of(*cell) if wanted[cell] else "" for cell in wanted]
     gap = {"vertical_spacing": 0.3 / len(noises), "horizontal_spacing": 0.25 / len(tasks)}  # where names of axes go
     figure = make_subplots(rows=len(noises), cols=len(tasks), subplot_titles=titles, **gap)
-    figure.update_xaxes(title_text=STEPS)
+    figure.update_xaxes(title_text=steps_label(tidy))
     figure.update_yaxes(title_text=RETURN)
     named: set[str] = set()
     for row, noise in enumerate(noises, start=1):
@@ -119,7 +164,8 @@ def interactive(tidy: pd.DataFrame) -> graph_objects.Figure:
             if cell.empty:
                 place = figure.get_subplot(row, column)  # whose axes no note can refer to, for nothing is drawn in it
                 x, y = (sum(axis.domain) / 2 for axis in (place.xaxis, place.yaxis))
-                figure.add_annotation(text=NOT_RUN, x=x, y=y, xref="paper", yref="paper", showarrow=False)
+                text = NOT_RUN if wanted[task, noise] else ""
+                figure.add_annotation(text=text, x=x, y=y, xref="paper", yref="paper", showarrow=False)
                 figure.update_xaxes(visible=False, row=row, col=column)
                 figure.update_yaxes(visible=False, row=row, col=column)
             for algorithm, color in palette(algorithms).items():
@@ -190,7 +236,9 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
         )
         guider = f"{cell['guider_mean']:.0f}" if "guider_mean" in cell else ""
         seeds = ", ".join(f"{value:.0f}" for value in cell["final"])
-        first = (cell["task"], f"{cell['noise']:g}", cell["algorithm"], seeds, f"{cell['final_mean']:.0f}")
+        noise = "" if cell["noise"] is None else f"{cell['noise']:g}"
+        after = f", after {cell[NEEDED]:,} steps of needed runs" if NEEDED in cell else ""
+        first = (cell["task"], noise, cell["algorithm"] + after, seeds, f"{cell['final_mean']:.0f}")
         rows.append((*first, f"{iqm:.0f} [{low:.0f}, {high:.0f}]", guider, kl))
     return markdown(head, rows)
 
@@ -258,8 +306,11 @@ def main() -> None:
     parser.add_argument(
         "--runs", type=Path, default=Path(__file__).parent / "runs", help="what the page's links to logs point at"
     )
+    parser.add_argument(
+        "--own-steps", action="store_true", help="draw a run from its own start, not after those that it needs"
+    )
     options = parser.parse_args()
-    tidy = pd.read_csv(options.results.with_suffix(".csv"))
+    tidy = read_tidy(options.results.with_suffix(".csv"), options.own_steps)
     results = json.loads(options.results.with_suffix(".json").read_text())
     draw(tidy, options.results.with_suffix(".png"))
     runs = os.path.relpath(options.runs, options.results.parent)

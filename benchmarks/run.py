@@ -24,16 +24,17 @@ from typing import Any
 import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
 import sb3_gac
 from benchmarks.checkpoint import checkpoints_of, locked, write_atomically
-from benchmarks.config import POLICY, environment, instantiate, resolve
-from benchmarks.suite import HERE, RUNS, RunSpec, made_with, read_suite
+from benchmarks.config import POLICY, resolve
+from benchmarks.environments import make_envs
+from benchmarks.suite import HERE, RUNS, RunSpec, made_with, needed_runs, read_suite
+from sb3_gac.presets import instantiate
 
 EVAL_SEED = 10_000
-CONFIGURATION = "config.yaml"
+CONFIGURATION, MODEL = "config.yaml", "model.zip"
 
 
 def provenance() -> dict[str, Any]:
@@ -57,20 +58,36 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     :param progress_bar: whether to show one
     :return: the run's directory
     :raises RuntimeError: if another process is running it
-    :raises ValueError: if its directory holds a run with another configuration
+    :raises ValueError: if its directory holds a run with another configuration, or a run that it needs is not finished
     """
     directory = spec.directory(root)
     if spec.is_finished(root):
         return directory
+    models = {argument: str(model_of(needed, root)) for argument, needed in needed_runs(spec).items()}
     directory.mkdir(parents=True, exist_ok=True)
     with locked(directory):
         algorithm_class, arguments = resolve(spec)
         configuration = {"run": dataclasses.asdict(spec), "arguments": arguments}
         _refuse_other_settings(directory / CONFIGURATION, configuration)
-        history = _train(spec, directory, algorithm_class, configuration, progress_bar)
+        history = _train(spec, directory, algorithm_class, configuration, models, progress_bar)
         write_evaluations(history, directory / "evaluations.csv")
         checkpoints_of(algorithm_class, directory).remove()
     return directory
+
+
+def model_of(spec: RunSpec, root: Path) -> Path:
+    """
+    :param spec: of a run that another one needs
+    :param root: directory of all runs
+    :return: its model as it was in the end
+    :raises ValueError: if it is not there
+    """
+    path = spec.directory(root) / MODEL
+    if not spec.is_finished(root):
+        raise ValueError(f"{path.parent} is needed, and not finished: run it first, as benchmarks.launch does.")
+    if not path.exists():
+        raise ValueError(f"{path} is needed, and gone: remove {path.parent}, and run it again.")
+    return path
 
 
 def _refuse_other_settings(path: Path, configuration: dict[str, Any]) -> None:
@@ -117,20 +134,24 @@ class Stopwatch(BaseCallback):
 
 
 def _train(
-    spec: RunSpec, directory: Path, algorithm_class: Any, configuration: dict[str, Any], progress_bar: bool
+    spec: RunSpec,
+    directory: Path,
+    algorithm_class: Any,
+    configuration: dict[str, Any],
+    models: dict[str, str],
+    progress_bar: bool,
 ) -> list[dict[str, float]]:
     """
+    :param models: argument -> file of the model that it is
     :return: one row per evaluation
     """
-    env_id, env_kwargs = environment(spec)
-    env = make_vec_env(env_id, spec.envs, seed=spec.seed, env_kwargs=env_kwargs)
-    eval_env = make_vec_env(env_id, spec.eval_episodes, env_kwargs=env_kwargs)
+    env, eval_env = make_envs(spec, spec.envs, spec.seed), make_envs(spec, spec.eval_episodes)
     every = spec.eval_every // spec.envs
     evaluation = _evaluation_class(algorithm_class)(
         eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=spec.eval_episodes, verbose=0
     )
     checkpoints = checkpoints_of(algorithm_class, directory)
-    arguments = {"policy": POLICY, **instantiate(configuration["arguments"]), "seed": spec.seed}
+    arguments = {"policy": POLICY, **instantiate(configuration["arguments"]), **models, "seed": spec.seed}
     resumed = checkpoints.resume(algorithm_class, arguments, env, spec.seed)
     _write_configuration(directory / CONFIGURATION, configuration, resumed=resumed is not None)
     stopwatch = Stopwatch(directory / "timing.json", evaluation, resumed=resumed is not None)
@@ -142,7 +163,7 @@ def _train(
     callbacks = [evaluation, checkpoints.callback(evaluation, every * spec.envs), stopwatch]
     left = spec.steps - model.num_timesteps
     model.learn(left, callback=callbacks, reset_num_timesteps=False, progress_bar=progress_bar)
-    model.save(directory / "model")
+    model.save(directory / MODEL)
     stopwatch.write()
     return evaluation.history
 
@@ -172,8 +193,18 @@ def main() -> None:
     parser.add_argument("--suite", type=Path, required=True)
     parser.add_argument("--index", type=int, required=True, help="which run of the suite, see launch --dry-run")
     parser.add_argument("--runs", type=Path, default=RUNS)
+    parser.add_argument(
+        "--needed",
+        nargs="+",
+        default=[],
+        metavar="ARGUMENT",
+        help="not that run, but the one whose model it needs as this argument",
+    )
     options = parser.parse_args()
-    print(run(read_suite(options.suite)[options.index], options.runs, progress_bar=sys.stderr.isatty()))
+    spec = read_suite(options.suite)[options.index]
+    for argument in options.needed:
+        spec = needed_runs(spec)[argument]
+    print(run(spec, options.runs, progress_bar=sys.stderr.isatty()))
 
 
 if __name__ == "__main__":

@@ -1,18 +1,27 @@
 """A suite: which algorithms, on which tasks, at which noise levels, with which seeds. Read from YAML, checked by name."""
 
+import re
+import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from sb3_gac.presets import read_preset
+
 HERE = Path(__file__).parent
 RUNS = HERE / "runs"
 HYPERPARAMS = HERE / "hyperparams"
-_SUITE_KEYS = {"steps", "envs", "preset", "eval_every", "eval_episodes", "overrides", "cells"}
-_CELL_KEYS = {"task", "noises", "algorithms", "seeds"}
+_COMMON = ("steps", "envs", "preset", "eval_every", "eval_episodes")
+_SUITE_KEYS = {*_COMMON, "overrides", "algorithms", "cells"}
+_SHARED_KEYS = {"algorithms", "seeds", "needs"}
+_TASK_KEYS = {"task", "noises", *_SHARED_KEYS}
+_ENV_KEYS = {"env", "env_kwargs", "wrappers", "name", *_SHARED_KEYS}
+_NAME = re.compile(r"\w[\w.+-]*")
+_WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # other digits may be in quotes for a reason
 
 
 @dataclass(frozen=True)
@@ -20,21 +29,25 @@ class RunSpec:
     """
     One training run.
 
-    :param algorithm: a name in ``hyperparams/algorithms.yml``
-    :param task: as in ``sb3_gac/<task>-v<version>``
-    :param noise: standard deviation of the sensor noise
+    :param algorithm: a name in ``hyperparams/algorithms.yml``, or in the suite's own ``algorithms``
+    :param task: as in ``sb3_gac/<task>-v<version>``, or the name of any other environment
+    :param noise: standard deviation of the sensor noise, ``None`` for an environment that is not asked for one
     :param seed: of everything random
     :param steps: environment steps
     :param envs: environments side by side
-    :param preset: a name in ``hyperparams/presets``, the arguments to start from
+    :param preset: a name in ``sb3_gac/presets``, the arguments to start from
     :param eval_every: environment steps between evaluations
     :param eval_episodes: of each evaluation
     :param overrides: arguments of the algorithm that replace those of the preset
+    :param environment: ``id``, ``kwargs`` and ``wrappers`` of one that is no registered task
+    :param definition: of the algorithm, where the suite has it
+    :param needs: argument of the algorithm -> ``algorithm``, ``steps``, ``definition`` and ``needs`` of the run whose model
+        that argument is
     """
 
     algorithm: str
     task: str
-    noise: float
+    noise: float | None
     seed: int
     steps: int
     envs: int
@@ -42,10 +55,18 @@ class RunSpec:
     eval_every: int
     eval_episodes: int
     overrides: dict[str, Any] = field(default_factory=dict)
+    environment: dict[str, Any] | None = None
+    definition: dict[str, Any] | None = None
+    needs: dict[str, dict[str, Any]] | None = None
+
+    @property
+    def cell(self) -> str:
+        """What a directory is called after, for all algorithms and seeds."""
+        return self.task if self.noise is None else f"{self.task}-noise{self.noise:g}"
 
     def directory(self, root: Path) -> Path:
         """Where this run's files go."""
-        return root / f"{self.preset}-{self.steps}" / f"{self.task}-noise{self.noise:g}" / self.algorithm / f"seed{self.seed}"
+        return root / f"{self.preset}-{self.steps}" / self.cell / self.algorithm / f"seed{self.seed}"
 
     def is_finished(self, root: Path) -> bool:
         """
@@ -61,6 +82,34 @@ class RunSpec:
         if changed:
             raise ValueError(f"{directory} holds a run with other settings under {changed}: remove it, or use another --runs.")
         return True
+
+
+def needed_runs(spec: RunSpec) -> dict[str, RunSpec]:
+    """
+    :param spec: of a run
+    :return: argument of its algorithm -> the run whose model it is: of the same task and seed, with the same settings
+    """
+    needs = spec.needs or {}
+    return {argument: replace(spec, **{"definition": None, "needs": None} | need) for argument, need in needs.items()}
+
+
+def with_needed(specs: Iterable[RunSpec]) -> Iterator[RunSpec]:
+    """
+    :param specs: of runs
+    :return: each after those that it needs
+    """
+    for spec in specs:
+        yield from with_needed(needed_runs(spec).values())
+        yield spec
+
+
+def needed_steps(spec: RunSpec) -> int:
+    """
+    :param spec: of a run
+    :return: environment steps of all runs that must come before it, each counted once
+    """
+    before = {needed.directory(Path()): needed.steps for needed in with_needed(needed_runs(spec).values())}
+    return sum(before.values())
 
 
 def made_with(configuration: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -82,6 +131,8 @@ def read_suite(path: Path) -> list[RunSpec]:
 
 def read_cells(path: Path) -> list[list[RunSpec]]:
     """
+    Modules that a suite names are found beside it as well, from now on.
+
     :param path: YAML file
     :return: its runs, by entry of its ``cells`` and noise
     :raises ValueError: if a key is unknown or missing, or a run is listed twice
@@ -89,8 +140,8 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
     suite = yaml.safe_load(path.read_text())
     check_is(path.name, suite, "a mapping", Mapping)
     if "preset" in suite:
-        suite = {**read_preset(suite["preset"])["run"], **suite}
-    check_keys(path.name, suite, _SUITE_KEYS, _SUITE_KEYS - {"overrides"})
+        suite = {**read_preset(suite["preset"]).run, **suite}
+    check_keys(path.name, suite, _SUITE_KEYS, {*_COMMON, "cells"})
     for key in ("steps", "envs", "eval_every", "eval_episodes"):
         check_is(f"{path.name}, {key}", suite[key], "a whole number above 0", int, lambda number: number > 0)
     if not suite["envs"] <= suite["eval_every"] <= suite["steps"]:
@@ -98,47 +149,187 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
         raise ValueError(f"{path.name}: eval_every must be from envs to steps, or no evaluation is made; there are {numbers}.")
     check_is(f"{path.name}, overrides", suite.get("overrides", {}), "a mapping", Mapping)
     check_is(f"{path.name}, cells", suite["cells"], "a list of at least one cell", list, len)
-    cells = [runs for cell in suite["cells"] for runs in _cells_by_noise(path.name, suite, cell)]
-    count = Counter(str(spec.directory(Path())) for cell in cells for spec in cell)
-    if twice := sorted(directory for directory, times in count.items() if times > 1):
-        raise ValueError(f"{path.name} lists these runs more than once: {twice}.")
+    cells = _Reader(path.name, suite).cells()
+    _check_distinct(path.name, [spec for cell in cells for spec in cell])
+    if str(path.parent.resolve()) not in sys.path:
+        sys.path.append(str(path.parent.resolve()))
     return cells
 
 
-def _cells_by_noise(name: str, suite: dict[str, Any], cell: dict[str, Any]) -> Iterator[list[RunSpec]]:
-    where = f"{name}, a cell"
-    check_is(where, cell, "a mapping", Mapping)
-    check_keys(where, cell, _CELL_KEYS, _CELL_KEYS)
-    for key, kinds, what in (
-        ("noises", (int, float), "numbers"),
-        ("seeds", int, "whole numbers"),
-        ("algorithms", str, "names"),
-    ):
-        check_is(f"{where}, {key}", cell[key], f"a list of at least one of {what}", list, len)
-        for value in cell[key]:
-            check_is(f"{where}, {key}", value, f"{what}, each", kinds, lambda value: isinstance(value, str) or value >= 0)
-    common = {key: suite[key] for key in ("steps", "envs", "preset", "eval_every", "eval_episodes")}
-    common["overrides"] = suite.get("overrides", {})
-    for noise in cell["noises"]:
-        runs = ((algorithm, seed) for seed in cell["seeds"] for algorithm in cell["algorithms"])
-        yield [RunSpec(algorithm, cell["task"], float(noise), seed, **common) for algorithm, seed in runs]
+def _check_distinct(name: str, specs: list[RunSpec]) -> None:
+    count = Counter(str(spec.directory(Path())) for spec in specs)
+    if twice := sorted(directory for directory, times in count.items() if times > 1):
+        raise ValueError(f"{name} lists these runs more than once: {twice}.")
+    runs: dict[Path, RunSpec] = {}
+    for spec in with_needed(specs):
+        directory = spec.directory(Path())
+        if runs.setdefault(directory, spec) != spec:
+            raise ValueError(f"{name}: {directory} is needed in two ways, that differ in what it needs itself.")
+    environments: dict[str, dict[str, Any] | None] = {}
+    for spec in specs:
+        if environments.setdefault(spec.cell, spec.environment) != spec.environment:
+            raise ValueError(f"{name} has two environments with the name {spec.cell!r}: give one of them another name.")
 
 
-def read_preset(name: str) -> dict[str, Any]:
+def read_definitions() -> dict[str, Any]:
+    """Name -> definition, of ``hyperparams/algorithms.yml``: class, arguments, and what it needs."""
+    definitions: dict[str, Any] = yaml.safe_load((HYPERPARAMS / "algorithms.yml").read_text())
+    return definitions
+
+
+class _Reader:
     """
-    :param name: of a file in ``hyperparams/presets``
-    :return: its ``run`` settings, ``arguments`` and ``tasks``
-    :raises ValueError: if there is no such preset, or it has unknown keys
+    :param name: of a suite's file, for messages
+    :param suite: its content, of which the numbers were checked
     """
-    path = HYPERPARAMS / "presets" / f"{name}.yml"
-    if not path.exists():
-        raise ValueError(f"preset must be one of {sorted(p.stem for p in path.parent.glob('*.yml'))}, got {name!r}.")
-    preset = yaml.safe_load(path.read_text())
-    check_keys(path.name, preset, {"run", "arguments", "tasks"}, {"run", "arguments"})
-    check_keys(f"{path.name}, run", preset["run"], {"envs", "steps"}, set())
-    for task, settings in preset.get("tasks", {}).items():
-        check_keys(f"{path.name}, {task}", settings, {"arguments", "noises"}, set())
-    return preset
+
+    def __init__(self, name: str, suite: dict[str, Any]):
+        self._name, self._suite = name, suite
+        self._own = suite.get("algorithms", {})
+        where = f"{name}, algorithms"
+        check_is(where, self._own, "a mapping from names to definitions", Mapping)
+        everybodys = read_definitions()
+        self._definitions = {**everybodys, **self._own}
+        if again := sorted(set(self._own) & set(everybodys)):
+            raise ValueError(f"{where}: hyperparams/algorithms.yml has {again} already, give yours another name.")
+        for algorithm, definition in self._own.items():
+            check_is(where, algorithm, "names of letters, digits and . + -", str, _NAME.fullmatch)
+            check_is(f"{where}, {algorithm}", definition, "a mapping", Mapping)
+
+    def cells(self) -> list[list[RunSpec]]:
+        """By entry of ``cells`` and noise."""
+        return [runs for number, cell in enumerate(self._suite["cells"], 1) for runs in self._by_noise(number, cell)]
+
+    def _by_noise(self, number: int, cell: Any) -> Iterator[list[RunSpec]]:
+        where = f"{self._name}, cell {number}"
+        check_is(where, cell, "a mapping", Mapping)
+        environment, task, noises = self._environment(where, cell)
+        _check_list(f"{where}, seeds", cell["seeds"], "whole numbers", int)
+        _check_list(f"{where}, algorithms", cell["algorithms"], "names", str)
+        common = {key: self._suite[key] for key in _COMMON} | {"overrides": self._suite.get("overrides", {})}
+        particulars = self._particulars(where, cell)
+        for noise in noises:
+            yield [
+                RunSpec(name, task, noise, seed, **common, environment=environment, **particulars[name])
+                for seed in cell["seeds"]
+                for name in cell["algorithms"]
+            ]
+
+    def _environment(self, where: str, cell: Any) -> tuple[dict[str, Any] | None, str, list[float | None]]:
+        """One that is no registered task, if it is none; its name, and its noises."""
+        if "env" in cell:
+            check_keys(where, cell, _ENV_KEYS, {"env", "algorithms", "seeds"})
+            environment, name = read_environment(where, cell), cell.get("name", default_name(cell["env"]))
+            check_is(f"{where}, name", name, "a name of letters, digits and . + -", str, _NAME.fullmatch)
+            return environment, name, [None]
+        check_keys(where, cell, _TASK_KEYS, _TASK_KEYS - {"needs"})
+        _check_list(f"{where}, noises", cell["noises"], "numbers", (int, float))
+        return None, cell["task"], [float(noise) for noise in cell["noises"]]
+
+    def _particulars(self, where: str, cell: Any) -> dict[str, dict[str, Any]]:
+        """Each algorithm's definition, if it is the suite's, and what it needs."""
+        changes = cell.get("needs", {})
+        check_is(f"{where}, needs", changes, "a mapping", Mapping)
+        if unknown := sorted(set(changes) - set(cell["algorithms"])):
+            raise ValueError(f"{where}, needs: the cell has no algorithms {unknown}; it has {cell['algorithms']}.")
+        return {
+            name: {
+                "definition": self._own.get(name),
+                "needs": self._needs(f"{where}, {name}", name, self._suite["steps"], changes.get(name, {})),
+            }
+            for name in cell["algorithms"]
+        }
+
+    def _needs(
+        self, where: str, name: str, steps: int, changes: Mapping[str, Any], above: tuple[str, ...] = ()
+    ) -> dict[str, dict[str, Any]] | None:
+        """What an algorithm needs, with the cell's changes, and what that needs in turn."""
+        if name in above:
+            raise ValueError(f"{where}: {' needs '.join([*above, name])}, and so on for ever.")
+        defined = (self._definitions.get(name) or {}).get("needs", {})
+        for needs in (defined, changes):
+            check_is(f"{where}, needs", needs, "a mapping from arguments to runs", Mapping)
+        found = {}
+        for argument in {**defined, **changes}:
+            need = {"steps": steps, **_checked(where, argument, defined), **_checked(where, argument, changes)}
+            part = f"{where}, needs, {argument}"
+            check_keys(part, need, {"algorithm", "steps"}, {"algorithm"})
+            check_is(
+                f"{part}, algorithm", need["algorithm"], f"one of {sorted(self._definitions)}", str, self._definitions.get
+            )
+            least = self._suite["eval_every"]
+            check_is(f"{part}, steps", need["steps"], f"a whole number from eval_every, {least}, on", int, least.__le__)
+            inner = self._needs(where, need["algorithm"], need["steps"], {}, (*above, name))
+            own = {"definition": self._own.get(need["algorithm"]), "needs": inner}
+            found[argument] = need | {key: value for key, value in own.items() if value is not None}
+        return found or None
+
+
+def _checked(where: str, argument: str, needs: Mapping[str, Any]) -> Mapping[str, Any]:
+    need: Mapping[str, Any] = needs.get(argument, {})
+    check_is(f"{where}, needs, {argument}", need, "a mapping, with algorithm and steps", Mapping)
+    return need
+
+
+def _check_list(where: str, values: Any, what: str, kinds: type | tuple[type, ...]) -> None:
+    check_is(where, values, f"a list of at least one of {what}", list, len)
+    for value in values:
+        check_is(where, value, f"{what}, each", kinds, lambda value: isinstance(value, str) or value >= 0)
+
+
+def read_environment(where: str, cell: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param where: for the message
+    :param cell: with ``env``, and ``env_kwargs`` and ``wrappers`` if it has them
+    :return: ``id``, ``kwargs`` and ``wrappers``: one mapping each, from ``module:Class`` to keyword arguments
+    :raises ValueError: if one of them is something else
+    """
+    check_is(f"{where}, env", cell["env"], "an id, as in CartPole-v1 or my_module:MyEnv-v0", str, len)
+    kwargs, wrappers = cell.get("env_kwargs", {}), cell.get("wrappers", [])
+    _check_kwargs(f"{where}, env_kwargs", kwargs)
+    check_is(f"{where}, wrappers", wrappers, "a list", list)
+    found = []
+    for wrapper in wrappers:
+        named = {wrapper: {}} if isinstance(wrapper, str) else wrapper
+        what = "module:Class, alone or with keyword arguments, each"
+        check_is(f"{where}, wrappers", named, what, Mapping, lambda named: len(named) == 1 and all(map(_is_path, named)))
+        ((path, arguments),) = named.items()
+        _check_kwargs(f"{where}, wrappers, {path}", arguments)
+        found.append({path: dict(arguments)})
+    return {"id": cell["env"], "kwargs": dict(kwargs), "wrappers": found}
+
+
+def default_name(env_id: Any) -> str:
+    """
+    :param env_id: of an environment
+    :return: what it is called without a name: its id, without a module
+    """
+    return str(env_id).rpartition(":")[2].replace("/", "-")
+
+
+def _is_path(text: Any) -> bool:
+    return isinstance(text, str) and all(text.partition(":"))
+
+
+def _check_kwargs(where: str, kwargs: Any) -> None:
+    check_is(
+        where, kwargs, "a mapping of keyword arguments", Mapping, lambda kwargs: all(isinstance(key, str) for key in kwargs)
+    )
+    check_numbers(where, kwargs, lambda value: isinstance(value, str) and _WITH_EXPONENT.fullmatch(value))
+
+
+def check_numbers(where: str, value: Any, is_meant: Callable[[Any], Any] | None = None) -> None:
+    """
+    :param where: for the message
+    :param value: arguments, or what they hold
+    :param is_meant: whether a value must have been meant as a number, :func:`is_number_as_text` by default
+    :raises ValueError: naming a number that YAML reads as text
+    """
+    if (is_meant or is_number_as_text)(value):
+        raise ValueError(f"{where}: YAML reads {value!r} as text: a number has a decimal point before its e, as in 1.0e-3.")
+    pairs = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in pairs:
+        check_numbers(f"{where}, {key}", inner, is_meant)
 
 
 def check_is(

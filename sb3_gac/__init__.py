@@ -8,6 +8,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from sb3_gac.algorithms import ALGORITHMS
 from sb3_gac.moved import find_moved_modules
 from sb3_gac.version import __version__
 
@@ -29,39 +30,35 @@ if TYPE_CHECKING:
     from sb3_gac.gac.ablations import GACShare, GACWithoutQ
     from sb3_gac.gac.gac import GAC
     from sb3_gac.gac.policies import GACPolicy
-    from sb3_gac.gac.presets import PRESETS, preset
     from sb3_gac.learner import Learner
+    from sb3_gac.presets import PRESETS, preset
     from sb3_gac.replay.buffer import CompactDictReplayBuffer
     from sb3_gac.replay.episodes import EpisodeReplayBuffer
 
 _WHERE = {
-    "GAC": "gac.gac",
-    "PRESETS": "gac.presets",
-    "TGRL": "baselines.tgrl",
-    "AsymmetricSAC": "baselines.asymmetric_sac",
-    "CheckpointError": "checkpoint.files",
-    "CompactDictReplayBuffer": "replay.buffer",
-    "DeploymentNormalizer": "deploy.normalization",
-    "DivergenceError": "checks.divergence",
-    "EnvironmentFailedError": "checks.environments",
-    "EpisodeReplayBuffer": "replay.episodes",
-    "ExactCheckpointCallback": "base.checkpoint_callback",
-    "GACPolicy": "gac.policies",
-    "GACShare": "gac.ablations",
-    "GACWithoutQ": "gac.ablations",
-    "GuiderLearnerEvalCallback": "base.callbacks",
-    "InvalidStepError": "checks.environments",
-    "Learner": "learner",
-    "SeededEvalCallback": "base.callbacks",
-    "export_learner": "deploy.export",
-    "preset": "gac.presets",
+    **{name: module for module, _, name in (path.partition(":") for path in ALGORITHMS.values())},
+    "PRESETS": "sb3_gac.presets",
+    "CheckpointError": "sb3_gac.checkpoint.files",
+    "CompactDictReplayBuffer": "sb3_gac.replay.buffer",
+    "DeploymentNormalizer": "sb3_gac.deploy.normalization",
+    "DivergenceError": "sb3_gac.checks.divergence",
+    "EnvironmentFailedError": "sb3_gac.checks.environments",
+    "EpisodeReplayBuffer": "sb3_gac.replay.episodes",
+    "ExactCheckpointCallback": "sb3_gac.base.checkpoint_callback",
+    "GACPolicy": "sb3_gac.gac.policies",
+    "GuiderLearnerEvalCallback": "sb3_gac.base.callbacks",
+    "InvalidStepError": "sb3_gac.checks.environments",
+    "Learner": "sb3_gac.learner",
+    "SeededEvalCallback": "sb3_gac.base.callbacks",
+    "export_learner": "sb3_gac.deploy.export",
+    "preset": "sb3_gac.presets",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _WHERE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)
+    return getattr(import_module(_WHERE[name]), name)
 
 
 def __dir__() -> list[str]:

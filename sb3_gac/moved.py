@@ -43,7 +43,12 @@ MOVED = {
         "common.serialization": "checkpoint.serialization",
         "common.training": "base.update",
         "common.vec_state": "checkpoint.vec_env",
+        "envs.layout": "envs.suites.layout",
+        "envs.mujoco": "envs.suites.mujoco",
+        "envs.pendulum": "envs.suites.pendulum",
+        "envs.popgym": "envs.suites.popgym",
         "export": "deploy.export",
+        "gac.presets": "presets",
         "verification": "deploy.verification",
     }.items()
 }

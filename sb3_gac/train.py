@@ -30,7 +30,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_gac import GAC, PRESETS, ExactCheckpointCallback, GuiderLearnerEvalCallback, __version__, preset
 from sb3_gac.checkpoint.files import checkpoints
 from sb3_gac.envs import PARTIAL
-from sb3_gac.envs.mujoco import TASKS
+from sb3_gac.envs.suites.mujoco import TASKS
 
 EVAL_SEED = 10_000
 EVALUATIONS = 10
@@ -234,7 +234,8 @@ def learn(
     )
     started = time.time()
     if options.resume is None:
-        model, left, before = GAC("MultiInputPolicy", env, seed=options.seed, **gac_arguments(options)), options.steps, 0.0
+        arguments = {"policy": "MultiInputPolicy", **gac_arguments(options)}
+        model, left, before = GAC(env=env, seed=options.seed, **arguments), options.steps, 0.0
     else:
         model = GAC.resume(directory / CHECKPOINTS, env)
         evaluation.history, before = model.resumed_notes["history"], model.resumed_notes["minutes"]

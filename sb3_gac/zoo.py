@@ -6,20 +6,24 @@ rl_zoo3 with the algorithms of this package::
     python -m sb3_gac.zoo enjoy --algo gac --env sb3_gac/HalfCheetah-v5 --folder logs
     python -m sb3_gac.zoo record_video --algo gac --env sb3_gac/HalfCheetah-v5 --folder logs
 
-Every option is rl_zoo3's, and so are its own algorithms (``--algo ppo``).  Ours have their hyperparameters from
-``sb3_gac/zoo_hyperparams`` unless ``--conf-file`` names others.
+Every option is rl_zoo3's, and so are its own algorithms (``--algo ppo``).  Ours, all of :mod:`sb3_gac.algorithms`, have the
+arguments of the preset ``small`` unless ``--conf-file`` names others.
 """
 
 import argparse
 import runpy
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from stable_baselines3.common.base_class import BaseAlgorithm
+import yaml
 
-from sb3_gac import GAC, AsymmetricSAC
+from sb3_gac.algorithms import ALGORITHMS, algorithm_class, name_of
+from sb3_gac.envs.suites import SUITES
+from sb3_gac.presets import merge, read_preset
 
 try:
     import optuna
@@ -29,35 +33,38 @@ try:
 except ImportError as error:
     raise ImportError(f'sb3_gac.zoo needs rl_zoo3, and {error.name} is not there: pip install "sb3_gac[zoo]".') from error
 
-HYPERPARAMS = Path(__file__).parent / "zoo_hyperparams"
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"gac": GAC, "asymmetric_sac": AsymmetricSAC}
+PRESET, N_TIMESTEPS = "small", 100_000
 _NET_ARCHS = {"small": [128, 128], "medium": [256, 256], "large": [400, 300]}
 
 
-def sample_asymmetric_sac(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+def hyperparameters(name: str) -> dict[str, dict[str, Any]]:
     """
-    Arguments of AsymmetricSAC for one trial of ``-optimize``.
+    :param name: of an algorithm
+    :return: environment id or "default" -> what rl_zoo3 trains with: the preset's arguments, of which ``role_keys`` are for
+        the registered tasks alone, where the privileged entry is the whole state
+    """
+    preset = read_preset(PRESET)
+    arguments: dict[str, Any] = {"n_envs": preset.envs, "n_timesteps": N_TIMESTEPS, "policy": "MultiInputPolicy"}
+    for layer in preset.layers(algorithm_class(name), None, 0.0):
+        arguments = merge(arguments, layer)
+    default = {key: value for key, value in arguments.items() if key != "role_keys"}
+    with_whole_state = [env_id for suite in SUITES.values() if suite.sensor_noise for env_id in suite.environments]
+    return {"default": default, **dict.fromkeys(with_whole_state, arguments)}
 
+
+def sample(name: str, trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Arguments for one trial of ``-optimize``: those of all algorithms, and those of this one and its ancestors.
+
+    :param name: of an algorithm
     :param trial: of Optuna
     :param n_actions: unused, see rl_zoo3
     :param n_envs: unused
     :param additional_args: unused
     """
-    return convert(_suggest_shared(trial))
-
-
-def sample_gac(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Arguments of GAC for one trial of ``-optimize``: those of AsymmetricSAC, and how far the guider may go.
-
-    :param trial: of Optuna
-    :param n_actions: unused, see rl_zoo3
-    :param n_envs: unused
-    :param additional_args: unused
-    """
-    target_kl = trial.suggest_float("target_kl", 3e-4, 0.1, log=True)
-    kl_coef_learning_rate = trial.suggest_float("kl_coef_learning_rate", 3e-4, 3e-2, log=True)
-    return convert(_suggest_shared(trial) | {"target_kl": target_kl, "kl_coef_learning_rate": kl_coef_learning_rate})
+    families = {"all", *map(name_of, algorithm_class(name).__mro__)}
+    suggested = [suggest(trial) for family, suggest in SUGGESTIONS.items() if family in families]
+    return convert({argument: value for arguments in suggested for argument, value in arguments.items()})
 
 
 def _suggest_shared(trial: optuna.Trial) -> dict[str, Any]:
@@ -69,6 +76,19 @@ def _suggest_shared(trial: optuna.Trial) -> dict[str, Any]:
         "target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"]),
         "net_arch": trial.suggest_categorical("net_arch", list(_NET_ARCHS)),
     }
+
+
+def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
+    """How far the guider may go."""
+    target_kl = trial.suggest_float("target_kl", 3e-4, 0.1, log=True)
+    return {
+        "target_kl": target_kl,
+        "kl_coef_learning_rate": trial.suggest_float("kl_coef_learning_rate", 3e-4, 3e-2, log=True),
+    }
+
+
+#: "all", or an algorithm, with its subclasses -> what it has to sample
+SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {"all": _suggest_shared, "gac": _suggest_guidance}
 
 
 def convert(sampled_params: dict[str, Any]) -> dict[str, Any]:
@@ -85,8 +105,8 @@ def convert(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
 def register() -> None:
     """Make the algorithms known to rl_zoo3."""
-    utils.ALGOS.update(ALGORITHMS)
-    hyperparams_opt.HYPERPARAMS_SAMPLER.update(gac=sample_gac, asymmetric_sac=sample_asymmetric_sac)
+    utils.ALGOS.update({name: algorithm_class(name) for name in ALGORITHMS})
+    hyperparams_opt.HYPERPARAMS_SAMPLER.update({name: partial(sample, name) for name in ALGORITHMS})
     hyperparams_opt.HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert))
 
 
@@ -109,15 +129,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     own, options = parser.parse_known_args(list(sys.argv[1:] if arguments is None else arguments)[:1])
     options = list(sys.argv[2:] if arguments is None else arguments[1:])
     register()
-    if own.script == "train":
-        options = with_hyperparameters(options)
-    sys.argv = [f"{sys.argv[0]} {own.script}", *options]
-    SCRIPTS[own.script]()
+    with TemporaryDirectory() as directory:
+        if own.script == "train":
+            options = with_hyperparameters(options, Path(directory))
+        sys.argv = [f"{sys.argv[0]} {own.script}", *options]
+        SCRIPTS[own.script]()
 
 
-def with_hyperparameters(options: list[str]) -> list[str]:
+def with_hyperparameters(options: list[str], directory: Path) -> list[str]:
     """
     :param options: of rl_zoo3's ``train``
+    :param directory: for the file of hyperparameters, which rl_zoo3 reads, and writes with the model
     :return: with ``--conf-file`` added if they name an algorithm of this package and no such file
     """
     parser = argparse.ArgumentParser(add_help=False)
@@ -126,7 +148,9 @@ def with_hyperparameters(options: list[str]) -> list[str]:
     known, _ = parser.parse_known_args(options)
     if known.conf_file is not None or known.algo not in ALGORITHMS:
         return options
-    return [*options, "--conf-file", str(HYPERPARAMS / f"{known.algo}.yml")]
+    path = directory / f"{known.algo}.yml"
+    path.write_text(yaml.safe_dump(hyperparameters(known.algo), sort_keys=False))
+    return [*options, "--conf-file", str(path)]
 
 
 if __name__ == "__main__":

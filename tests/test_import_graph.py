@@ -29,6 +29,8 @@ FORBIDDEN = {
         for name in BASELINES
         for pattern in ("{}.py", "{}/**/*.py")
     },
+    "sb3_gac/algorithms.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
+    "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.algorithms\b)",
     "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
     "benchmarks/report.py": r"torch\b|sb3_gac\b|benchmarks\b",

@@ -4,9 +4,11 @@ import importlib
 import pickle
 import sys
 
+import gymnasium as gym
 import pytest
 
 from sb3_gac.checkpoint.serialization import dereference
+from sb3_gac.envs.suites import SUITES
 from sb3_gac.moved import MOVED
 
 
@@ -26,6 +28,26 @@ def test_what_was_saved_names_the_former_modules():
 
     assert pickle.loads(b"csb3_gac.common.buffers\nCompactDictReplayBuffer\n.") is CompactDictReplayBuffer
     assert dereference("sb3_gac.common.buffers:CompactDictReplayBuffer") is CompactDictReplayBuffer
+
+
+@pytest.mark.parametrize("suite", ["mujoco", "pendulum", "popgym"])
+def test_suites_of_environments_are_found_where_they_were(suite, recwarn):
+    from sb3_gac import envs
+
+    sys.modules.pop(f"sb3_gac.envs.{suite}", None)
+    vars(envs).pop(suite, None)
+    assert SUITES[suite].environments == getattr(envs, suite).ENVIRONMENTS
+    assert f"sb3_gac.envs.{suite} is sb3_gac.envs.suites.{suite} now" in str(recwarn.pop(DeprecationWarning).message)
+    register = getattr(envs, f"register_{suite}")
+    assert f'is sb3_gac.envs.suites.register("{suite}") now' in str(recwarn.pop(DeprecationWarning).message)
+    for env_id in SUITES[suite].environments:
+        specification = gym.registry.pop(env_id)
+        with pytest.MonkeyPatch.context() as context:
+            context.setattr(gym.envs.registration, "current_namespace", None)
+            register()
+        assert gym.registry[env_id] == specification
+    with pytest.raises(AttributeError, match="register_chess"):
+        envs.register_chess  # noqa: B018
 
 
 def test_other_names_are_nowhere():

@@ -64,3 +64,13 @@ def test_an_editable_installation_is_a_path_that_type_checkers_follow(tmp_path):
     with zipfile.ZipFile(wheel) as contents:
         (pth,) = [name for name in contents.namelist() if name.endswith(".pth")]
         assert contents.read(pth).decode().split() == [str(tmp_path)]
+
+
+def test_every_file_of_arguments_in_the_package_is_shipped():
+    parser = configparser.ConfigParser()
+    parser.read(ROOT / "setup.cfg")
+    patterns = parser["options.package_data"]["sb3_gac"].split()
+    shipped = {path for pattern in patterns for path in (ROOT / "sb3_gac").glob(pattern)}
+    there = set((ROOT / "sb3_gac").rglob("*.yml"))
+    assert there
+    assert there <= shipped

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
@@ -11,8 +10,10 @@ import yaml
 pytest.importorskip("rl_zoo3")
 
 from sb3_gac import envs
-from sb3_gac.zoo import ALGORITHMS, HYPERPARAMS, convert, sample_asymmetric_sac, sample_gac, with_hyperparameters
+from sb3_gac.algorithms import ALGORITHMS, algorithm_class
+from sb3_gac.zoo import convert, hyperparameters, sample, with_hyperparameters
 
+TRAINED = ("gac", "asymmetric_sac")
 ENV = "sb3_gac/InvertedDoublePendulum-v5"
 QUICK = ["learning_starts:20", "batch_size:8", "policy_kwargs:dict(net_arch=[8])", "n_envs:1", "gradient_steps:1"]
 
@@ -29,13 +30,13 @@ def _zoo(script, folder, *options):
 def trained(tmp_path_factory):
     """A folder in which each algorithm was trained for a moment."""
     folder = tmp_path_factory.mktemp("zoo")
-    for algorithm in ALGORITHMS:
+    for algorithm in TRAINED:
         options = ("--algo", algorithm, "-n", 120, "--env-kwargs", "noise_std:0.2", "--eval-freq", 60, "--eval-episodes", 1)
         _zoo("train", folder, *options, "-params", *QUICK)
     return folder
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", TRAINED)
 def test_train_saves_what_the_zoo_saves(trained, algorithm):
     (run,) = (trained / "logs" / algorithm).iterdir()
     files = {path.name for path in run.rglob("*")}
@@ -45,7 +46,7 @@ def test_train_saves_what_the_zoo_saves(trained, algorithm):
     assert "privileged" in config, "from our YAML: critics on the state alone"
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", TRAINED)
 def test_enjoy_runs_the_deployed_policy(trained, algorithm):
     output = _zoo("enjoy", trained, "--algo", algorithm, "--folder", "logs", "-n", 50, "--no-render")
     assert "Mean reward" in output
@@ -82,9 +83,10 @@ def test_sampled_values_become_arguments():
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_our_algorithms_have_our_hyperparameters(algorithm):
+def test_our_algorithms_have_our_hyperparameters(algorithm, tmp_path):
     for options in (["--algo", algorithm, "-n", "5"], ["-n", "5", f"--algo={algorithm}"]):
-        assert with_hyperparameters(options) == [*options, "--conf-file", str(HYPERPARAMS / f"{algorithm}.yml")]
+        assert with_hyperparameters(options, tmp_path) == [*options, "--conf-file", str(tmp_path / f"{algorithm}.yml")]
+        assert yaml.safe_load((tmp_path / f"{algorithm}.yml").read_text()) == hyperparameters(algorithm)
 
 
 @pytest.mark.parametrize(
@@ -98,8 +100,8 @@ def test_our_algorithms_have_our_hyperparameters(algorithm):
         ["--env", "CartPole-v1"],
     ],
 )
-def test_a_file_of_ones_own_and_other_algorithms_are_left_to_the_zoo(options):
-    assert with_hyperparameters(options) == options
+def test_a_file_of_ones_own_and_other_algorithms_are_left_to_the_zoo(options, tmp_path):
+    assert with_hyperparameters(options, tmp_path) == options
 
 
 def test_the_zoos_own_algorithms_train(tmp_path):
@@ -122,11 +124,16 @@ def test_the_zoos_own_algorithms_train(tmp_path):
     assert (tmp_path / "logs" / "ppo").is_dir()
 
 
-def test_every_registered_task_has_hyperparameters():
-    for algorithm in ALGORITHMS:
-        settings = yaml.safe_load((HYPERPARAMS / f"{algorithm}.yml").read_text())
-        assert {f"sb3_gac/{task}-v5" for task in envs.mujoco.TASKS} <= set(settings)
-        assert Path(HYPERPARAMS / f"{algorithm}.yml").is_file()
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_algorithm_has_hyperparameters_that_it_takes_for_every_registered_task(algorithm):
+    settings = hyperparameters(algorithm)
+    assert {"default", "sb3_gac/Pendulum-v1"} == set(settings) - {f"sb3_gac/{task}-v5" for task in envs.suites.mujoco.TASKS}
+    assert settings[ENV]["role_keys"] == {"critic": ["privileged"]}
+    assert "role_keys" not in settings["default"], "elsewhere the privileged entry may not be the whole state"
+    shared = {"n_envs": 4, "n_timesteps": 100_000, "policy": "MultiInputPolicy", "batch_size": 128, "gradient_steps": -1}
+    assert shared.items() <= settings["default"].items()
+    arguments = {key: value for key, value in settings[ENV].items() if key not in ("n_envs", "n_timesteps")}
+    algorithm_class(algorithm)(env=envs.make_mujoco("InvertedDoublePendulum"), **arguments | {"buffer_size": 10})
 
 
 def test_every_argument_that_is_sampled_is_used():
@@ -140,7 +147,8 @@ def test_every_argument_that_is_sampled_is_used():
         suggest_categorical = staticmethod(lambda name, choices: choices[0])
 
     shared = {"gamma", "learning_rate", "batch_size", "tau", "target_entropy", "policy_kwargs"}
-    of_gac, of_sac = (sample(Trial(), 1, 1, {}) for sample in (sample_gac, sample_asymmetric_sac))
+    of_gac, of_share, of_sac = (sample(name, Trial(), 1, 1, {}) for name in ("gac", "gac_share", "asymmetric_sac"))
     assert set(of_sac) == shared
     assert set(of_gac) == shared | {"target_kl", "kl_coef_learning_rate"}
+    assert set(of_share) == set(of_gac), "as a subclass of GAC"
     assert (of_gac["gamma"], of_gac["batch_size"], of_gac["target_kl"]) == (0.999, 64, 3e-4)

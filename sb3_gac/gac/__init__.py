@@ -1,1 +1,1 @@
-"""Guided Actor-Critic, its policies, ablations and presets."""
+"""Guided Actor-Critic, its policies and ablations."""

@@ -34,12 +34,11 @@ import yaml
 from gymnasium import spaces
 
 import benchmarks.aggregate
-import benchmarks.config
 import benchmarks.launch
 import benchmarks.report
 import benchmarks.run
 import benchmarks.suite
-import sb3_gac
+import sb3_gac.presets
 from sb3_gac import GAC, AsymmetricSAC
 
 PROGRESS = {10: 2, 20: 30, 30: 4}  # the last is neither the best nor the mean
@@ -54,11 +53,11 @@ SUITE = {
 PRESET = {
     "run": {"envs": 2},
     "arguments": {"all": {"batch_size": 20, "learning_starts": 1000, "policy_kwargs": {"net_arch": [1]}}},
-    "tasks": {"Toy": {"arguments": {"ToyGAC": {"batch_size": 40}}, "noises": {0.2: {"all": {"batch_size": 50}}}}},
+    "tasks": {"Toy": {"arguments": {f"{__name__}:ToyGAC": {"batch_size": 40}}, "noises": {0.2: {"all": {"batch_size": 50}}}}},
 }
 ALGORITHMS = {
-    "toy-gac": {"class": "ToyGAC", "target_update_interval": 3},
-    "toy-asym": {"class": "ToyAsym", "target_update_interval": 5, "learning_starts": 4000},
+    "toy-gac": {"class": f"{__name__}:ToyGAC", "target_update_interval": 3},
+    "toy-asym": {"class": f"{__name__}:ToyAsym", "target_update_interval": 5, "learning_starts": 4000},
 }
 
 
@@ -122,15 +121,11 @@ class InThisProcess:
 def made(tmp_path_factory):
     """Directory of what the programs leave, and what each of them says."""
     root = tmp_path_factory.mktemp("golden")
-    (root / "presets").mkdir()
-    for name, content in (("presets/toy", PRESET), ("algorithms", ALGORITHMS), ("suite", SUITE)):
+    for name, content in (("toy", PRESET), ("algorithms", ALGORITHMS), ("suite", SUITE)):
         (root / f"{name}.yml").write_text(yaml.safe_dump(content))
     with pytest.MonkeyPatch.context() as context:
-        for module in (benchmarks.suite, benchmarks.config):
-            context.setattr(module, "HYPERPARAMS", root)
-        for toy in (ToyGAC, ToyAsym):
-            context.setattr(sb3_gac, toy.__name__, toy, raising=False)
-        context.setattr(sb3_gac, "__all__", [*sb3_gac.__all__, "ToyGAC", "ToyAsym"])
+        context.setattr(benchmarks.suite, "HYPERPARAMS", root)
+        context.setattr(sb3_gac.presets, "DIRECTORY", root)
         context.setattr(benchmarks.launch, "LocalEngine", InThisProcess)
         context.setattr(benchmarks.run, "provenance", lambda: {"commit": "abc", "versions": {}, "cpus": 1})
         context.setitem(gym.registry, "sb3_gac/Toy-v0", gym.envs.registration.EnvSpec("sb3_gac/Toy-v0", entry_point=Toy))

@@ -20,15 +20,17 @@ from stable_baselines3.common.callbacks import ConvertCallback
 
 import benchmarks.config
 import benchmarks.run
-import benchmarks.suite
+import sb3_gac.presets
 from benchmarks.aggregate import finished_runs, origins
 from benchmarks.checkpoint import SB3Checkpoints, checkpoints_of, locked
-from benchmarks.config import check_runs, environment, instantiate, read_algorithm, resolve
+from benchmarks.config import check_runs, read_algorithm, resolve
+from benchmarks.environments import environment
 from benchmarks.finished import kind_of, name_of
 from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
-from benchmarks.suite import RunSpec, made_with, read_preset, read_suite
-from sb3_gac import GAC
+from benchmarks.suite import RunSpec, made_with, read_suite
+from sb3_gac import GAC, PRESETS, preset
+from sb3_gac.presets import instantiate, read_preset
 from tests.helpers import small_model
 
 ROOT = Path(__file__).parents[2]
@@ -225,15 +227,15 @@ def test_a_failing_run_is_named_with_its_log(tmp_path):
         ({"overrides": [1]}, r"suite.yml, overrides: must be a mapping, got \[1\]"),
         ({"cells": []}, "suite.yml, cells: must be a list of at least one cell"),
         ({"cells": {"task": "Ant"}}, "suite.yml, cells: must be a list"),
-        ({"cells": ["Ant"]}, "suite.yml, a cell: must be a mapping, got 'Ant'"),
-        ({"cells": [CELL | {"seed": 1}]}, r"suite.yml, a cell: unknown keys \['seed'\]"),
-        ({"cells": [CELL | {"seeds": ["0"]}]}, "a cell, seeds: must be whole numbers, each, got '0'"),
-        ({"cells": [CELL | {"seeds": [-1]}]}, "a cell, seeds: must be whole numbers, each, got -1"),
-        ({"cells": [CELL | {"seeds": [0.5]}]}, "a cell, seeds: must be whole numbers, each, got 0.5"),
-        ({"cells": [CELL | {"noises": 0.1}]}, "a cell, noises: must be a list of at least one of numbers, got 0.1"),
-        ({"cells": [CELL | {"noises": ["1e-1"]}]}, "a cell, noises: must be numbers, each, got '1e-1'. YAML reads"),
-        ({"cells": [CELL | {"algorithms": "gac"}]}, "a cell, algorithms: must be a list of at least one of names, got 'gac'"),
-        ({"cells": [CELL | {"algorithms": [1]}]}, "a cell, algorithms: must be names, each, got 1"),
+        ({"cells": ["Ant"]}, "suite.yml, cell 1: must be a mapping, got 'Ant'"),
+        ({"cells": [CELL | {"seed": 1}]}, r"suite.yml, cell 1: unknown keys \['seed'\]"),
+        ({"cells": [CELL | {"seeds": ["0"]}]}, "cell 1, seeds: must be whole numbers, each, got '0'"),
+        ({"cells": [CELL | {"seeds": [-1]}]}, "cell 1, seeds: must be whole numbers, each, got -1"),
+        ({"cells": [CELL | {"seeds": [0.5]}]}, "cell 1, seeds: must be whole numbers, each, got 0.5"),
+        ({"cells": [CELL | {"noises": 0.1}]}, "cell 1, noises: must be a list of at least one of numbers, got 0.1"),
+        ({"cells": [CELL | {"noises": ["1e-1"]}]}, "cell 1, noises: must be numbers, each, got '1e-1'. YAML reads"),
+        ({"cells": [CELL | {"algorithms": "gac"}]}, "cell 1, algorithms: must be a list of at least one of names, got 'gac'"),
+        ({"cells": [CELL | {"algorithms": [1]}]}, "cell 1, algorithms: must be names, each, got 1"),
     ],
 )
 def test_unknown_and_missing_keys_are_refused(tmp_path, change, message):
@@ -306,16 +308,13 @@ def test_directories_tell_runs_apart():
 
 
 def test_arguments_of_a_class_are_over_those_of_its_ancestors(tmp_path, monkeypatch):
-    (tmp_path / "presets").mkdir()
     arguments = {
         "all": {"tau": 0.1, "gamma": 0.1, "batch_size": 1},
-        "GACShare": {"tau": 0.3},
-        "GAC": {"tau": 0.2, "gamma": 0.2},
+        "gac_share": {"tau": 0.3},
+        "gac": {"tau": 0.2, "gamma": 0.2},
     }
-    (tmp_path / "presets" / "layers.yml").write_text(yaml.safe_dump({"run": {}, "arguments": arguments}))
-    (tmp_path / "algorithms.yml").write_text(yaml.safe_dump({"gac-share": {"class": "GACShare"}}))
-    for module in (benchmarks.suite, benchmarks.config):
-        monkeypatch.setattr(module, "HYPERPARAMS", tmp_path)
+    (tmp_path / "layers.yml").write_text(yaml.safe_dump({"run": {"envs": 4}, "arguments": arguments}))
+    monkeypatch.setattr(sb3_gac.presets, "DIRECTORY", tmp_path)
     _, arguments = resolve(RunSpec("gac-share", "Ant", 0.1, 7, 1000, 4, "layers", 500, 1))
     assert (arguments["tau"], arguments["gamma"], arguments["batch_size"]) == (0.3, 0.2, 1)
 
@@ -406,6 +405,16 @@ def test_the_papers_preset_has_the_papers_values(task, noise, target_kl):
     assert set(arguments) - set(of_sac) == {"guider", "learner_entropy", "target_kl"}
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize(("algorithm", "name"), [("gac", "gac"), ("gac-share", "gac_share"), ("sac-asym", "asymmetric_sac")])
+def test_a_run_has_the_arguments_of_the_preset_that_everybody_reads(noise, algorithm, name):
+    for of_preset in PRESETS:
+        for task in ("Ant", "HalfCheetah", "InvertedDoublePendulum", "Hopper"):
+            _, arguments = resolve(RunSpec(algorithm, task, noise, 0, 2_000_000, 128, of_preset, 500, 1))
+            wanted = {"buffer_size": 1_000_000, **preset(of_preset, algorithm=name, task=task, noise=noise)}
+            assert instantiate(arguments) == wanted, (of_preset, task)
+
+
 def test_table_4_has_the_papers_values():
     spec = RunSpec("gac", "popgym-RepeatPreviousEasy", 0.0, 0, 10**7, 1, "paper-popgym", 1, 1)
     _, arguments = resolve(spec)
@@ -430,9 +439,7 @@ def test_tasks_without_sensor_noise_have_none():
 
 def test_every_algorithm_fits_every_preset():
     algorithms = set(yaml.safe_load((ROOT / "benchmarks/hyperparams/algorithms.yml").read_text()))
-    presets = [path.stem for path in (ROOT / "benchmarks/hyperparams/presets").glob("*.yml")]
-    assert len(presets) >= 3
-    for preset_name in presets:
+    for preset_name in PRESETS:
         for algorithm in algorithms if preset_name == "sb3" else algorithms - {"sb3-sac"}:
             algorithm_class, arguments = resolve(RunSpec(algorithm, "Ant", 0.1, 0, 1000, 4, preset_name, 500, 1))
             env = gym.make("sb3_gac/InvertedDoublePendulum-v5")

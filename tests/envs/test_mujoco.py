@@ -97,7 +97,7 @@ def _diverge():
 
 @pytest.mark.usefixtures("_muted")
 def test_other_warnings_of_mujoco_are_passed_on(monkeypatch):
-    monkeypatch.setattr("sb3_gac.envs.mujoco.make_task", _compile_a_model_that_warns_twice)
+    monkeypatch.setattr("sb3_gac.envs.suites.mujoco.make_task", _compile_a_model_that_warns_twice)
     with pytest.warns(UserWarning, match="MuJoCo: .*Nan") as caught:
         make_mujoco("HalfCheetah")
     assert not [warning for warning in caught if "settotalmass" in str(warning.message)]

@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import sb3_gac.envs
-from sb3_gac.envs.popgym import LEVELS, TASKS, make_popgym
+from sb3_gac.envs.suites.popgym import LEVELS, TASKS, make_popgym
 
 pytest.importorskip("popgym")
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_gac.envs.layout import TaskLayout, make_task
+from sb3_gac.envs.suites.layout import TaskLayout, make_task
 
 
 def _positions_first(env_id: str, n_positions: int, n_velocities: int, **kwargs: Any) -> TaskLayout:
@@ -99,12 +99,12 @@ def _without_deprecation() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def register_mujoco() -> None:
-    """Register ``sb3_gac/<task>-v5`` for every task, with gymnasium's time limit of 1,000 steps."""
-    for task in TASKS:
-        gym.register(
-            f"sb3_gac/{task}-v5",
-            entry_point="sb3_gac.envs.mujoco:make_mujoco",
-            max_episode_steps=1000,
-            kwargs={"task": task},
-        )
+#: Id -> how gymnasium makes it, with its time limit of 1,000 steps
+ENVIRONMENTS: dict[str, dict[str, Any]] = {
+    f"sb3_gac/{task}-v5": {
+        "entry_point": f"{__name__}:make_mujoco",
+        "max_episode_steps": 1000,
+        "kwargs": {"task": task},
+    }
+    for task in TASKS
+}

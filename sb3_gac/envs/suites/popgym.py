@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 from sb3_gac.envs.actions import FlattenMultiDiscrete
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
+from sb3_gac.envs.suites.extras import import_extra
 from sb3_gac.envs.wrappers import Observation, PreviousAction, reset_with
 
 LEVELS = ("Easy", "Medium", "Hard")
@@ -183,10 +184,7 @@ def make_popgym(task: str, previous_reward: bool = False, **summary: Any) -> gym
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {list(TASKS)}, got {task!r}.")
-    try:
-        from popgym import envs as games
-    except ImportError:
-        raise ImportError(f'sb3_gac/popgym-{task}-v0 needs POPGym: pip install "sb3_gac[popgym]".') from None
+    games = import_extra("popgym.envs", "popgym", f"sb3_gac/popgym-{task}-v0")
     game = getattr(games, task)()
     name = next(name for name in SUMMARIES if task.startswith(name))
     env: gym.Env = SummarisedGame(game, SUMMARIES[name](game, **summary))
@@ -195,7 +193,7 @@ def make_popgym(task: str, previous_reward: bool = False, **summary: Any) -> gym
     return PreviousAction(env, reward=previous_reward)
 
 
-def register_popgym() -> None:
-    """Register ``sb3_gac/popgym-<task>-v0`` for every task; the games end by themselves."""
-    for task in TASKS:
-        gym.register(f"sb3_gac/popgym-{task}-v0", entry_point="sb3_gac.envs.popgym:make_popgym", kwargs={"task": task})
+#: Id -> how gymnasium makes it; the games end by themselves
+ENVIRONMENTS: dict[str, dict[str, Any]] = {
+    f"sb3_gac/popgym-{task}-v0": {"entry_point": f"{__name__}:make_popgym", "kwargs": {"task": task}} for task in TASKS
+}

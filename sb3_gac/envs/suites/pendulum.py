@@ -4,7 +4,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_gac.envs.layout import TaskLayout, make_task
+from sb3_gac.envs.suites.layout import TaskLayout, make_task
 
 LAYOUT = TaskLayout("Pendulum-v1", partial=(0, 1), velocity=(2,))
 
@@ -23,6 +23,7 @@ def make_pendulum(noise_std: float = 0.0, privileged: str = "state", **kwargs: A
     return make_task(LAYOUT, noise_std, privileged, **kwargs)
 
 
-def register_pendulum() -> None:
-    """Register ``sb3_gac/Pendulum-v1``, with gymnasium's time limit of 200 steps."""
-    gym.register("sb3_gac/Pendulum-v1", entry_point="sb3_gac.envs.pendulum:make_pendulum", max_episode_steps=200)
+#: Id -> how gymnasium makes it, with its time limit of 200 steps
+ENVIRONMENTS: dict[str, dict[str, Any]] = {
+    "sb3_gac/Pendulum-v1": {"entry_point": f"{__name__}:make_pendulum", "max_episode_steps": 200}
+}

@@ -1,0 +1,59 @@
+"""The environment of a run: a registered task with its sensor noise, or any of gymnasium's, with arguments and wrappers."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
+
+from benchmarks.suite import RunSpec
+from sb3_gac.algorithms import import_path
+from sb3_gac.envs.suites import SUITES, suite_of, task_of
+
+
+def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
+    """
+    :param spec: of a run
+    :return: id and keyword arguments of its environment; without sensor noise there need be no argument for it
+    :raises ValueError: if there is no such task
+    """
+    if spec.environment is not None:
+        return spec.environment["id"], spec.environment["kwargs"]
+    ids = {task_of(name): name for name in gym.registry if name.startswith("sb3_gac/")}
+    if spec.task not in ids:
+        raise ValueError(f"task must be one of the registered sb3_gac/<task>-v<version>, {sorted(ids)}, got {spec.task!r}.")
+    suite = suite_of(ids[spec.task])
+    takes_noise = suite is None or SUITES[suite].sensor_noise
+    if spec.noise and not takes_noise:
+        raise ValueError(f"{spec.task} has no sensor noise: give noises: [0].")
+    return ids[spec.task], {"noise_std": spec.noise} if takes_noise else {}
+
+
+def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:
+    """
+    :param spec: of a run
+    :param n_envs: side by side
+    :param seed: of the first one
+    :raises ValueError: if a wrapper can't be imported
+    """
+    env_id, kwargs = environment(spec)
+    if spec.environment is None:
+        return make_vec_env(env_id, n_envs, seed=seed, env_kwargs=kwargs)
+    # What counts returns goes around the wrappers: one of them may change rewards, or end episodes
+    return make_vec_env(partial(make_wrapped, env_id, kwargs, spec.environment["wrappers"]), n_envs, seed=seed)
+
+
+def make_wrapped(env_id: str, kwargs: Mapping[str, Any], wrappers: Sequence[Mapping[str, Mapping[str, Any]]]) -> gym.Env:
+    """
+    :param env_id: of gymnasium, after the module that registers it and a colon if need be
+    :param kwargs: of the environment
+    :param wrappers: from the inside to the outside, each ``module:Class`` and its keyword arguments
+    :raises ValueError: if a wrapper can't be imported
+    """
+    env = gym.make(env_id, **kwargs)
+    for wrapper in wrappers:
+        for path, arguments in wrapper.items():
+            env = import_path(path)(env, **arguments)
+    return env

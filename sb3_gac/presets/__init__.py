@@ -1,0 +1,177 @@
+"""
+Named sets of arguments: ``GAC("MultiInputPolicy", env, **preset("small"))``.
+
+Each is a YAML file beside this one, and read by everybody: by :func:`preset`, the main job, the zoo and the benchmarks::
+
+    run: {envs: 4}                  # environments side by side that it is meant for; and, if it says so, steps
+    arguments:
+      all: {batch_size: 128}        # of every algorithm
+      gac: {target_kl: 0.01}        # of that one and its subclasses alone, over those of all
+    tasks:                          # the same again, over the above: for a task, and for that task at a noise level
+      Ant: {arguments: {gac: {target_kl: 0.005}}, noises: {0.3: {gac: {target_kl: 0.001}}}}
+
+An algorithm has its name in :mod:`sb3_gac.algorithms`, or is ``module:Class``.  Activation functions and optimisers are
+torch's, by name.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from torch import nn, optim
+
+from sb3_gac.algorithms import ALGORITHMS, algorithm_class, name_of
+
+DIRECTORY = Path(__file__).parent
+_ALIASES = {"paper": "paper-brax"}
+_LIBRARIES = {"activation_fn": nn, "optimizer_class": optim}
+
+
+@dataclass(frozen=True)
+class Preset:
+    """
+    A file of arguments, as it is.
+
+    :param name: of the file
+    :param run: environments side by side that ``gradient_steps`` is meant for, ``envs``; and ``steps``, if it says so
+    :param arguments: "all" or the name of an algorithm -> arguments
+    :param tasks: task -> ``arguments``, and ``noises``: noise -> arguments
+    """
+
+    name: str
+    run: dict[str, int]
+    arguments: dict[str, dict[str, Any]]
+    tasks: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def envs(self) -> int:
+        """Environments side by side, for which ``gradient_steps`` is meant."""
+        return self.run["envs"]
+
+    def layers(self, algorithm: type, task: str | None, noise: float) -> Iterator[Mapping[str, Any]]:
+        """
+        :param algorithm: class that the arguments are for
+        :param task: as in ``sb3_gac/<task>-v5``, if it is one that has a name
+        :param noise: of that task
+        :return: arguments, the later over the earlier: in each part of the file those of all, of ancestors, and its own
+        """
+        families = ["all", *map(name_of, reversed(algorithm.__mro__))]
+        of_task = self.tasks.get(task or "", {})
+        noises = {float(level): sections for level, sections in of_task.get("noises", {}).items()}
+        for sections in (self.arguments, of_task.get("arguments", {}), noises.get(noise, {})):
+            yield from (sections[family] for family in families if family in sections)
+
+
+def read_preset(name: str) -> Preset:
+    """
+    :param name: of a preset
+    :return: what its file has
+    :raises ValueError: if there is no such preset, or its file has keys that mean nothing
+    """
+    path = DIRECTORY / f"{_ALIASES.get(name, name)}.yml"
+    if not path.exists():
+        raise ValueError(f"preset must be one of {sorted(PRESETS)}, got {name!r}.")
+    content = yaml.safe_load(path.read_text())
+    _check(path.name, content, {"run", "arguments", "tasks"}, {"run", "arguments"})
+    _check(f"{path.name}, run", content["run"], {"envs", "steps"}, {"envs"})
+    _check_sections(f"{path.name}, arguments", content["arguments"])
+    for task, settings in content.get("tasks", {}).items():
+        where = f"{path.name}, {task}"
+        _check(where, settings, {"arguments", "noises"})
+        _check_sections(f"{where}, arguments", settings.get("arguments", {}))
+        for noise, sections in settings.get("noises", {}).items():
+            if not isinstance(noise, int | float):
+                raise ValueError(f"{where}, noises: must be numbers, each, got {noise!r}.")
+            _check_sections(f"{where}, noise {noise}", sections)
+    return Preset(path.stem, **content)
+
+
+def _check_sections(where: str, sections: Any) -> None:
+    foreign = {name for name in sections if ":" in str(name)} if isinstance(sections, Mapping) else set()
+    _check(where, sections, {"all", *ALGORITHMS, *foreign})
+    for name, arguments in sections.items():
+        _check(f"{where}, {name}", arguments, set(arguments) if isinstance(arguments, Mapping) else set())
+
+
+def _check(where: str, content: Any, known: set[str], required: set[str] = frozenset()) -> None:  # type: ignore[assignment]
+    if not isinstance(content, Mapping):
+        raise ValueError(f"{where}: must be a mapping, got {content!r}.")
+    unknown, missing = sorted(set(map(str, content)) - known), sorted(required - set(content))
+    if unknown or missing:
+        raise ValueError(f"{where}: unknown keys {unknown}, missing keys {missing}; the keys are {sorted(known)}.")
+
+
+class _Presets(Mapping[str, Preset]):
+    """All presets by name. A file is read when it is asked for."""
+
+    def __getitem__(self, name: str) -> Preset:
+        if name not in set(self):
+            raise KeyError(name)
+        return read_preset(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted({path.stem for path in DIRECTORY.glob("*.yml")} | {*_ALIASES}))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+PRESETS: Mapping[str, Preset] = _Presets()
+
+
+def preset(
+    name: str, *, algorithm: str | type = "gac", task: str | None = None, noise: float = 0.0, **overrides: Any
+) -> dict[str, Any]:
+    """
+    :param name: one of ``PRESETS``, such as "small" or "paper"
+    :param algorithm: that the arguments are for: its class, or its name in :mod:`sb3_gac.algorithms`
+    :param task: as in ``sb3_gac/<task>-v5``: with what the preset has for it, if it has something
+    :param noise: of that task
+    :param overrides: arguments that replace those of the preset; ``policy_kwargs`` are merged
+    :return: keyword arguments of the algorithm, with its ``policy`` where the preset names one; ``PRESETS[name].envs``
+        environments go with them
+    :raises ValueError: if there is no such preset or algorithm
+    """
+    found = read_preset(name)
+    kind = algorithm if isinstance(algorithm, type) else _class_of(algorithm)
+    resolved: dict[str, Any] = {"policy_kwargs": {}}
+    for layer in found.layers(kind, task, noise):
+        resolved = merge(resolved, layer)
+    return merge(instantiate(resolved), overrides | {"policy_kwargs": overrides.get("policy_kwargs") or {}})
+
+
+def _class_of(algorithm: str) -> type:
+    try:
+        return algorithm_class(algorithm)
+    except ValueError as error:
+        raise ValueError(f"algorithm {error}") from None
+
+
+def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param below: arguments
+    :param above: what replaces them, key by key; ``policy_kwargs`` are merged
+    """
+    merged = dict(below)
+    for key, value in above.items():
+        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = merge(merged[key], value) if both and key == "policy_kwargs" else value
+    return merged
+
+
+def instantiate(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param arguments: as YAML has them
+    :return: as the class takes them: names of activations and optimisers become classes
+    :raises ValueError: if torch has none of that name
+    """
+    policy_kwargs = dict(arguments.get("policy_kwargs") or {})
+    for key, library in _LIBRARIES.items():
+        if key in policy_kwargs:
+            found = getattr(library, str(policy_kwargs[key]), None)
+            if not isinstance(found, type):
+                raise ValueError(f"policy_kwargs: {key} must name a class of {library.__name__}, got {policy_kwargs[key]!r}.")
+            policy_kwargs[key] = found
+    return {**arguments, "policy_kwargs": policy_kwargs}

@@ -1,0 +1,56 @@
+"""The table of registered environments."""
+
+import sys
+
+import gymnasium as gym
+import pytest
+
+from sb3_gac.envs.suites import SUITES, register, suite_of, task_of
+from sb3_gac.envs.suites.extras import import_extra
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_a_suites_environments_are_registered_as_the_table_says(name):
+    assert SUITES[name].environments
+    for env_id, arguments in SUITES[name].environments.items():
+        specification = gym.spec(env_id)
+        assert suite_of(env_id) == name
+        assert env_id.startswith(f"sb3_gac/{task_of(env_id)}-v")
+        assert {key: getattr(specification, key) for key in arguments} == arguments
+
+
+def test_every_registered_environment_is_in_a_suite():
+    ours = {env_id for env_id in gym.registry if env_id.startswith("sb3_gac/")}
+    assert ours == {env_id for suite in SUITES.values() for env_id in suite.environments}
+    assert suite_of("CartPole-v1") is None
+
+
+@pytest.mark.parametrize("name", [name for name, suite in SUITES.items() if suite.sensor_noise])
+def test_suites_that_say_so_take_sensor_noise_and_show_the_whole_state(name):
+    env_id = next(iter(SUITES[name].environments))
+    partial, state = (
+        [gym.make(env_id, noise_std=noise).reset(seed=0)[0][entry] for noise in (0.0, 1.0)]
+        for entry in ("partial", "privileged")
+    )
+    assert (partial[0] != partial[1]).all()
+    assert (state[0] == state[1]).all()
+    assert set(partial[0]) < set(state[0])
+
+
+def test_a_simulator_that_is_missing_is_named_with_its_extra(monkeypatch):
+    assert import_extra("json", "nothing", "Env-v0") is sys.modules["json"]
+    with pytest.raises(ImportError, match=r'Env-v0 needs no_such: pip install "sb3_gac\[chess\]"'):
+        import_extra("no_such.games", "chess", "Env-v0")
+
+
+def test_a_suite_of_ones_own_is_one_line_in_the_table(monkeypatch):
+    module = type(sys)("of_a_test")
+    module.ENVIRONMENTS = {"sb3_gac/Test-v3": {"entry_point": "gymnasium.envs.classic_control:PendulumEnv"}}
+    monkeypatch.setitem(sys.modules, "of_a_test", module)
+    monkeypatch.setitem(SUITES, "test", SUITES["popgym"]._replace(module="of_a_test"))
+    register("test")
+    try:
+        assert (suite_of("sb3_gac/Test-v3"), task_of("sb3_gac/Test-v3")) == ("test", "Test")
+        gym.make("sb3_gac/Test-v3").close()
+    finally:
+        gym.registry.pop("sb3_gac/Test-v3")
