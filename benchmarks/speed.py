@@ -139,8 +139,8 @@ def compare_deployment(sizes: tuple[int, int, int], width: int, rounds: int) -> 
     observation = {key: box.sample() for key, box in SpacesOnly(*sizes).observation_space.items()}  # type: ignore[attr-defined]
     with tempfile.TemporaryDirectory() as directory:
         path = sb3_gac.export_learner(gac, Path(directory) / "learner.onnx")
-        learner = sb3_gac.Learner.load(path)
-        load = timer(lambda: sb3_gac.Learner.load(path), time.process_time)
+        learner = sb3_gac.OnnxPolicy.load(path)
+        load = timer(lambda: sb3_gac.OnnxPolicy.load(path), time.process_time)
         loads = alternate({"load": load}, repetitions=10, rounds=rounds)["load"]
     partial = observation["partial"]
     timers = {

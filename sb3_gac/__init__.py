@@ -4,6 +4,7 @@ Guided Actor-Critic for Stable-Baselines3. Importing it registers the ``sb3_gac/
 All else is imported when it is first used: :mod:`sb3_gac.learner` runs on machines that have neither torch nor gymnasium.
 """
 
+import warnings
 from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from sb3_gac.gac.ablations import GACShare, GACWithoutQ
     from sb3_gac.gac.gac import GAC
     from sb3_gac.gac.policies import GACPolicy
-    from sb3_gac.learner import Learner
+    from sb3_gac.learner import OnnxPolicy
     from sb3_gac.presets import PRESETS, preset
     from sb3_gac.replay.buffer import CompactDictReplayBuffer
     from sb3_gac.replay.episodes import EpisodeReplayBuffer
@@ -48,14 +49,20 @@ _WHERE = {
     "GACPolicy": "sb3_gac.gac.policies",
     "GuiderLearnerEvalCallback": "sb3_gac.base.callbacks",
     "InvalidStepError": "sb3_gac.checks.environments",
-    "Learner": "sb3_gac.learner",
+    "OnnxPolicy": "sb3_gac.learner",
     "SeededEvalCallback": "sb3_gac.base.callbacks",
     "export_learner": "sb3_gac.deploy.export",
     "preset": "sb3_gac.presets",
 }
 
 
+_RENAMED = {"Learner": "OnnxPolicy"}
+
+
 def __getattr__(name: str) -> Any:
+    if name in _RENAMED:
+        warnings.warn(f"sb3_gac.{name} is sb3_gac.{_RENAMED[name]} now.", DeprecationWarning, stacklevel=2)
+        name = _RENAMED[name]
     if name not in _WHERE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_WHERE[name]), name)
@@ -82,7 +89,7 @@ __all__ = [
     "GACWithoutQ",
     "GuiderLearnerEvalCallback",
     "InvalidStepError",
-    "Learner",
+    "OnnxPolicy",
     "SeededEvalCallback",
     "__version__",
     "envs",

@@ -1,13 +1,14 @@
 """
 The deployed policy on the robot: an exported ONNX file and its actions, with numpy and onnxruntime alone::
 
-    from sb3_gac.learner import Learner
+    from sb3_gac.learner import OnnxPolicy
 
-    learner = Learner.load("cheetah.onnx")
+    learner = OnnxPolicy.load("cheetah.onnx")
     action = learner.act(partial)
 """
 
 import json
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ except ImportError as error:
 METADATA_KEY = "sb3_gac"
 
 
-class Learner:
+class OnnxPolicy:
     """
     A policy that was written by :func:`sb3_gac.deploy.export.export_learner`; it acts deterministically.
 
@@ -41,7 +42,7 @@ class Learner:
         self._state: np.ndarray | None = None
 
     @classmethod
-    def load(cls, path: str | Path) -> "Learner":
+    def load(cls, path: str | Path) -> "OnnxPolicy":
         """
         :param path: of a file that :func:`sb3_gac.deploy.export.export_learner` wrote
         :raises ValueError: if it is another file
@@ -128,3 +129,10 @@ class Learner:
                     f'The entry "{name}" holds values that are not from {smallest} to {largest}: {array.tolist()}.'
                 )
         return array
+
+
+def __getattr__(name: str) -> Any:
+    if name != "Learner":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warnings.warn("sb3_gac.learner.Learner is OnnxPolicy now.", DeprecationWarning, stacklevel=2)
+    return OnnxPolicy

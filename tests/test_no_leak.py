@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, Learner, export_learner
+from sb3_gac import GAC, AsymmetricSAC, OnnxPolicy, export_learner
 from sb3_gac.envs import History
 from tests.helpers import Sampled, small_model
 
@@ -215,7 +215,7 @@ def check_files(model, tmp_path):
         assert key.encode() not in path.read_bytes()
         assert key not in str(scripted.inlined_graph)
     with pytest.raises(ValueError, match=f"not read: {_privileged(model)}".replace("[", r"\[").replace("]", r"\]")):
-        Learner.load(path).act({key: value[0] for key, value in _sequence(model)[0].items()})
+        OnnxPolicy.load(path).act({key: value[0] for key, value in _sequence(model)[0].items()})
 
 
 def check_saved_learner(model, tmp_path):

@@ -141,7 +141,7 @@ class DataCollection(OffPolicyAlgorithm):
     def _cut_episodes(self) -> None:
         """The environments are about to be reset: what was stored last is not continued by what comes next."""
         if isinstance(self.replay_buffer, CompactDictReplayBuffer):
-            self.replay_buffer.cut()
+            self.replay_buffer.mark_reset()
         elif isinstance(self.replay_buffer, HerReplayBuffer):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

@@ -45,7 +45,7 @@ class FrozenPolicy(nn.Module):
         policy: Any = self.policy
         if isinstance(policy, AsymmetricPolicy):
             outputs = {role: getattr(policy, role).distribution(obs) for role in policy.roles.policies}
-            return policy.action_distributions(outputs)[policy.roles.behaviour]
+            return policy.acting_distributions(outputs)[policy.roles.behaviour]
         space = policy.observation_space
         entries = {key: encode(obs[key], space[key], policy.normalize_images) for key in space.spaces}
         latent = policy.actor.latent_pi(policy.actor.features_extractor(entries))

@@ -32,7 +32,7 @@ from sb3_gac.networks.actors import Actor, BoundedPolicy, DeployedPolicy, RolePo
 from sb3_gac.networks.critics import CriticEnsemble, DiscreteCriticEnsemble
 from sb3_gac.networks.encoders import EntryExtractor, VectorExtractor
 from sb3_gac.networks.heads import LOG_STD_BOUNDS
-from sb3_gac.networks.recurrent import Memory
+from sb3_gac.networks.recurrent import RecurrentCore
 from sb3_gac.optim.polyak import polyak_average
 from sb3_gac.optim.trained import TrainedParameters
 
@@ -45,7 +45,7 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
     The networks of an algorithm's ``roles``, each reading the observation entries of its role, and their optimisers.
 
     Each network is the attribute of its role's name, and its target is ``<role>_target``. A subclass names its ``roles``; it
-    overrides :meth:`make_policy` where a policy is of another class, and :meth:`action_distributions` where policies act
+    overrides :meth:`make_policy` where a policy is of another class, and :meth:`acting_distributions` where policies act
     relative to each other.
 
     :param observation_space: Dict
@@ -214,7 +214,7 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
             return {"features_dim": features_dim, "net_arch": net_arch}
         hidden_size = options["rnn_hidden_size"]
         members = self.n_critics if role in self.roles.critics else 1
-        memory = Memory(rnn_type, features_dim, net_arch, hidden_size, options["activation_fn"], members)
+        memory = RecurrentCore(rnn_type, features_dim, net_arch, hidden_size, options["activation_fn"], members)
         return {"memory": memory, "features_dim": hidden_size, "net_arch": options["rnn_net_arch"]}
 
     def _make_extractor(self, role: str, keys: Sequence[str]) -> BaseFeaturesExtractor:
@@ -337,7 +337,7 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
                 f"predict() is for observations of {list(self.role_keys[self.roles.deployed])} alone."
             )
 
-    def action_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:
+    def acting_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:
         """
         :param outputs: role -> what its network computed, for each policy
         :return: role -> distribution of its actions
@@ -367,7 +367,7 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         names = self.roles.policies
         before = state or (None,) * len(names)
         steps = [getattr(self, name).remember(obs, own, episode_start) for name, own in zip(names, before, strict=True)]
-        policies = self.action_distributions(dict(zip(names, (output for output, _ in steps), strict=True)))
+        policies = self.acting_distributions(dict(zip(names, (output for output, _ in steps), strict=True)))
         after = tuple(remembered for _, remembered in steps)
         roles = list(dict.fromkeys(acting if acting is not None else [self.roles.behaviour]))
         actions = self._chosen(policies[roles[0]], deterministic)

@@ -64,14 +64,14 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
     def sac_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """The actor's return, with its entropy."""
         with th.no_grad():
-            next_q, log_prob = actor.later.expectation(batch.q_at_next_obs(self.policy.critic_target), noise)
+            next_q, log_prob = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
             target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta)
         return self.critic_loss("critic", batch, target)
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """Climb the critics, with entropy."""
         now = self.now("actor", actor, batch)
-        q, log_prob = now.expectation(batch.q_at_obs(self.policy.critic), noise)
+        q, log_prob = now.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
         seen = {f"actor_{name}": masked_mean(values, batch.mask) for name, values in now.diagnostics().items()}
         loss = policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask)
         return Loss(loss, {"entropy": -masked_mean(log_prob, batch.mask), **seen})

@@ -135,14 +135,14 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
     def reward_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """Q_R: the main actor's return, with its entropy; both actors climb it."""
         with th.no_grad():
-            next_q, log_prob = actor.later.expectation(batch.q_at_next_obs(self.policy.reward_critic_target), noise)
+            next_q, log_prob = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.reward_critic_target), noise)
             target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta)
         return self.critic_loss("reward_critic", batch, target)
 
     def teacher_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor) -> Loss:
         """Q_I: discounted -KL(actor || teacher) from the next observation on, and no reward."""
         with th.no_grad():
-            next_q, _ = actor.later.expectation(batch.q_at_next_obs(self.policy.teacher_critic_target), noise)
+            next_q, _ = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.teacher_critic_target), noise)
             kl = actor.later.kl(self.frozen["teacher"](batch.next_observations))
             target = batch.soft_target(next_q, reward=th.zeros_like(batch.rewards), kl=kl, kl_coef=1.0)
         return self.critic_loss("teacher_critic", batch, target)
@@ -150,8 +150,8 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor, c: th.Tensor) -> Loss:
         """beta log pi - min Q_R + c (KL - min Q_I)."""
         now = self.now("actor", actor, batch)
-        q, log_prob = now.expectation(batch.q_at_obs(self.policy.reward_critic), noise)
-        q_teacher, _ = now.expectation(batch.q_at_obs(self.policy.teacher_critic), noise)
+        q, log_prob = now.value_and_log_prob(batch.q_at_obs(self.policy.reward_critic), noise)
+        q_teacher, _ = now.value_and_log_prob(batch.q_at_obs(self.policy.teacher_critic), noise)
         kl = now.kl(self.frozen["teacher"](batch.observations))
         loss = policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask)
         imitation = policy_loss(q=q_teacher, kl=kl, kl_coef=1.0, mask=batch.mask)
@@ -160,7 +160,9 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
 
     def auxiliary_loss(self, batch: Batch, auxiliary: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """beta log pi_R - min Q_R."""
-        q, log_prob = self.now("auxiliary", auxiliary, batch).expectation(batch.q_at_obs(self.policy.reward_critic), noise)
+        q, log_prob = self.now("auxiliary", auxiliary, batch).value_and_log_prob(
+            batch.q_at_obs(self.policy.reward_critic), noise
+        )
         return Loss(policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask), {})
 
     # --- collecting ---------------------------------------------------------------------------------------------------

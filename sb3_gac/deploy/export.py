@@ -22,7 +22,6 @@ from sb3_gac.checks.values import check_positive, index_bounds
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import check_agreement, draw_observations
 from sb3_gac.networks.actors import DeployedPolicy
-from sb3_gac.networks.recurrent import Memory
 from sb3_gac.version import __version__
 
 ACTION, STATE, NEXT_STATE = "action", "state", "next_state"
@@ -111,7 +110,7 @@ def export_learner(
     verify_on: int = 256,
 ) -> Path:
     """
-    Write a model's deployed policy to a file, once its actions there are the model's: see :class:`sb3_gac.learner.Learner`
+    Write a model's deployed policy to a file, once its actions there are the model's: see :class:`sb3_gac.learner.OnnxPolicy`
     for its use.
 
     :param model: trained

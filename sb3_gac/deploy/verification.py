@@ -96,9 +96,9 @@ def _error(policy: DeployedPolicy, seen: Entries, state: tuple[np.ndarray, ...] 
 
 
 def _onnx_runner(path: Path, policy: DeployedPolicy, n: int) -> Callable[[Entries], np.ndarray]:
-    from sb3_gac.learner import Learner
+    from sb3_gac.learner import OnnxPolicy
 
-    return Learner.load(path).act
+    return OnnxPolicy.load(path).act
 
 
 def _torchscript_runner(path: Path, policy: DeployedPolicy, n: int) -> Callable[[Entries], np.ndarray]:

@@ -83,7 +83,7 @@ class Guider(RolePolicy):
         if self.max_kl is None:
             return output
         offset = (output.mean - learner.mean.detach()) / output.log_std.detach().exp()
-        return learner.corrected(self._bounded(output._replace(mean=offset)))
+        return learner.with_residual(self._bounded(output._replace(mean=offset)))
 
     def _bounded(self, correction: Any) -> Any:
         if self.max_kl is None:
@@ -112,7 +112,7 @@ class ResidualGuider(Guider):
 
     def relative_to(self, learner: Any, output: Any) -> Distribution:
         """See :meth:`Guider.relative_to`."""
-        return learner.corrected(self._bounded(output))
+        return learner.with_residual(self._bounded(output))
 
 
 GUIDERS: dict[str, type[Guider]] = {"residual": ResidualGuider, "independent": Guider}

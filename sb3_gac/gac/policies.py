@@ -124,9 +124,9 @@ class GACPolicy(AsymmetricPolicy):
         :param obs: full observation, B of each entry
         :return: shapes (B, A)
         """
-        return self.combine(self.guider.distribution(obs), self.learner.distribution(obs))
+        return self.action_distributions(self.guider.distribution(obs), self.learner.distribution(obs))
 
-    def combine(self, guider_output: Distribution, learner_output: Distribution) -> ActionDistributions:
+    def action_distributions(self, guider_output: Distribution, learner_output: Distribution) -> ActionDistributions:
         """
         :param guider_output: of the guider's network, for some batch
         :param learner_output: of the learner's network, for the same batch
@@ -135,13 +135,13 @@ class GACPolicy(AsymmetricPolicy):
         guider: Any = guider_output
         learner: Any = learner_output
         if self.learner.owns_std:
-            return ActionDistributions(self.guider.relative_to(learner, guider.borrowing(learner)), learner, learner)
+            return ActionDistributions(self.guider.relative_to(learner, guider.with_std_of(learner)), learner, learner)
         guider = self.guider.relative_to(learner, guider)
-        return ActionDistributions(guider, learner.borrowing(guider), learner)
+        return ActionDistributions(guider, learner.with_std_of(guider), learner)
 
-    def action_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:
-        """See :meth:`AsymmetricPolicy.action_distributions`."""
-        both = self.combine(outputs["guider"], outputs["learner"])
+    def acting_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:
+        """See :meth:`AsymmetricPolicy.acting_distributions`."""
+        both = self.action_distributions(outputs["guider"], outputs["learner"])
         return {"guider": both.guider, "learner": both.deployed}
 
 

@@ -62,8 +62,8 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     ) -> Loss:
         """Eq. 12: the guider's return, less what it pays for its distance to the learner."""
         with th.no_grad():
-            later = self.policy.combine(guider.later, learner.later)
-            next_q, log_prob = later.guider.expectation(batch.q_at_next_obs(self.policy.guider_critic_target), noise)
+            later = self.policy.action_distributions(guider.later, learner.later)
+            next_q, log_prob = later.guider.value_and_log_prob(batch.q_at_next_obs(self.policy.guider_critic_target), noise)
             kl = later.guider.kl_of_means(later.learner, self.kl_reduction)
             target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta, kl=kl, kl_coef=alpha)
         return self.critic_loss("guider_critic", batch, target)
@@ -72,8 +72,8 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
     ) -> Loss:
         """Eq. 13: climb the guided critics, close to the learner as it is."""
-        now = self.policy.combine(self.now("guider", guider, batch), learner.now.detach())
-        q, log_prob = now.guider.expectation(batch.q_at_obs(self.policy.guider_critic), noise)
+        now = self.policy.action_distributions(self.now("guider", guider, batch), learner.now.detach())
+        q, log_prob = now.guider.value_and_log_prob(batch.q_at_obs(self.policy.guider_critic), noise)
         kl = now.guider.kl_of_means(now.learner, self.kl_reduction)
         loss = policy_loss(q=q, log_prob=log_prob, ent_coef=beta, kl=kl, kl_coef=alpha, mask=batch.mask)
         return Loss(loss, self._seen_of_kl(kl.detach(), batch) | {"entropy": -masked_mean(log_prob, batch.mask)})
@@ -92,8 +92,8 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     def learner_critic_loss(self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """Eq. 15: the learner's own return."""
         with th.no_grad():
-            policy = self.policy.combine(guider.later, learner.later).learner
-            next_q, log_prob = policy.expectation(batch.q_at_next_obs(self.policy.critic_target), noise)
+            policy = self.policy.action_distributions(guider.later, learner.later).learner
+            next_q, log_prob = policy.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
             target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta * self.learner_entropy)
         return self.critic_loss("learner_critic", batch, target)
 
@@ -101,7 +101,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
     ) -> Loss:
         """Eq. 16, and the fit of what serves at deployment alone."""
-        now = self.policy.combine(guider.now.detach(), self.now("learner", learner, batch))
+        now = self.policy.action_distributions(guider.now.detach(), self.now("learner", learner, batch))
         loss = self.learner_objective(batch, now, noise, alpha, beta)
         fits = self.policy.learner.deployment_losses(now.deployed, now.learner, batch.mask)
         seen = {f"learner_{name}": masked_mean(values, batch.mask) for name, values in now.learner.diagnostics().items()}
@@ -116,7 +116,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         :param now: the policies at the observations, with the learner's gradient
         :return: scalar
         """
-        q, log_prob = now.learner.expectation(batch.q_at_obs(self.policy.critic), noise)
+        q, log_prob = now.learner.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
         kl = now.guider.detach().kl_of_means(now.learner, self.kl_reduction) if self.learner_kl_weight else 0.0
         weight, ent_coef = self.learner_kl_weight * alpha, beta * self.learner_entropy
         return policy_loss(q=q, log_prob=log_prob, ent_coef=ent_coef, kl=kl, kl_coef=weight, mask=batch.mask)

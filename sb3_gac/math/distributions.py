@@ -52,7 +52,7 @@ class TanhGaussian(NamedTuple):
         pre_tanh = self._pre_tanh(noise)
         return th.tanh(pre_tanh), self._log_prob(pre_tanh, noise)
 
-    def expectation(self, q_function: QFunction, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def value_and_log_prob(self, q_function: QFunction, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param q_function: actions -> values of N critics, shape (N, \\*E)
         :param noise: standard normal, shape (\\*E, A)
@@ -83,7 +83,7 @@ class TanhGaussian(NamedTuple):
         """
         return kl_shared_std(self.mean, other.mean, other.log_std.detach().exp(), reduction)
 
-    def corrected(self, correction: "TanhGaussian") -> "TanhGaussian":
+    def with_residual(self, correction: "TanhGaussian") -> "TanhGaussian":
         """
         This distribution, as a constant, with its mean moved by a correction, and the correction's std.
 
@@ -92,7 +92,7 @@ class TanhGaussian(NamedTuple):
         mean = self.mean.detach() + correction.log_std.detach().exp() * correction.mean
         return TanhGaussian(mean, correction.log_std)
 
-    def borrowing(self, lender: "TanhGaussian") -> "TanhGaussian":
+    def with_std_of(self, lender: "TanhGaussian") -> "TanhGaussian":
         """This mean with the lender's std, as a constant."""
         return TanhGaussian(self.mean, lender.log_std.detach())
 
@@ -145,7 +145,7 @@ class Categorical(NamedTuple):
         gumbel = -th.empty_like(self.logits).exponential_().log()
         return (self.logits + gumbel).argmax(dim=-1)
 
-    def expectation(self, q_function: QFunction, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def value_and_log_prob(self, q_function: QFunction, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Exact, over all actions, and with the smallest critic's value of each.
 
@@ -166,11 +166,11 @@ class Categorical(NamedTuple):
         """KL(self || other), shape (\\*E): there is no std to share."""
         return self.kl(other)
 
-    def corrected(self, correction: "Categorical") -> "Categorical":
+    def with_residual(self, correction: "Categorical") -> "Categorical":
         """This distribution, as a constant, with its logits moved by the correction's."""
         return Categorical(self.logits.detach() + correction.logits)
 
-    def borrowing(self, lender: "Categorical") -> "Categorical":
+    def with_std_of(self, lender: "Categorical") -> "Categorical":
         """Itself: there is no std to borrow."""
         return self
 

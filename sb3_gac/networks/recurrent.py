@@ -10,7 +10,7 @@ from torch import nn
 from sb3_gac.networks.layers import EnsembleLinear
 
 
-class Memory(nn.Module):
+class RecurrentCore(nn.Module):
     """
     Hidden layers and then one recurrent layer, for each member of an ensemble; the layers are batched over members, each
     recurrent layer takes one pass over time.

@@ -179,7 +179,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
             self._rows[group][self.pos] = values
         self._finals.forget_before((self._n_added - self.size()) * self.n_envs)
 
-    def cut(self) -> None:
+    def mark_reset(self) -> None:
         """Whoever resets the environments from outside says so: what was added last is not continued by what comes next."""
         if self._n_added:
             self._cut(np.ones(self.n_envs, dtype=bool))

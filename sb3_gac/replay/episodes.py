@@ -124,9 +124,9 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         self._index_ended(self._n_added - 2)  # may have been cut
         self._index_ended(self._n_added - 1)
 
-    def cut(self) -> None:
-        """See :meth:`CompactDictReplayBuffer.cut`."""
-        super().cut()
+    def mark_reset(self) -> None:
+        """See :meth:`CompactDictReplayBuffer.mark_reset`."""
+        super().mark_reset()
         self._index_ended(self._n_added - 1)
 
     def _index_ended(self, step: int) -> None:

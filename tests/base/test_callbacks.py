@@ -48,7 +48,7 @@ class Paid(gym.Env):
         return {"partial": partial, "privileged": np.float32([self.bonus])}
 
 
-class Memory(KVWriter):
+class RecurrentCore(KVWriter):
     """A log in a list."""
 
     def __init__(self):
@@ -82,7 +82,7 @@ def _mean_return(predict, env, seed=10_000):
 
 
 def test_logs_both_returns_at_every_evaluation():
-    model, memory = _model(_vec_env()), Memory()
+    model, memory = _model(_vec_env()), RecurrentCore()
     model.set_logger(Logger(None, [memory]))
     model.learn(30, callback=_callback(_vec_env()), log_interval=1)
     evaluations = [row for row in memory.rows if "eval/mean_reward" in row]

@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, Learner, export_learner
+from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, OnnxPolicy, export_learner
 from sb3_gac.checks.entries import computable
 from sb3_gac.networks.encoders import EntryExtractor, module_names
 from tests.helpers import Sampled, TwoViewBandit, small_model
@@ -81,7 +81,7 @@ def test_every_kind_is_trained_on_saved_and_exported(cls, cell, tmp_path):
         np.testing.assert_allclose(single, expected[row], atol=1e-5)
     model.save(tmp_path / "model")
     np.testing.assert_allclose(cls.load(tmp_path / "model").predict(batch, deterministic=True)[0], expected, atol=1e-6)
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
     np.testing.assert_allclose(learner.act(batch), expected, atol=1e-5)
     export_learner(model, tmp_path / "learner.pt", verify_on=8)
 
@@ -114,7 +114,7 @@ def test_every_box_is_normalised_and_exported(tmp_path):
     boxes = {key: space for key, space in ALL.spaces.items() if isinstance(space, spaces.Box)}
     env = VecNormalize(DummyVecEnv([lambda: Sampled(spaces.Dict(ALL.spaces))]), norm_obs_keys=list(boxes))
     model = small_model(env, role_keys={"learner": READS_ALL}, buffer_size=60, batch_size=4).learn(20)
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
     batch = _batch()
     expected, _ = model.predict(env.normalize_obs(batch), deterministic=True)
     np.testing.assert_allclose(learner.act({key: batch[key] for key in READS_ALL}), expected, atol=1e-5)
@@ -146,7 +146,7 @@ def test_entries_of_any_name_beside_an_image(tmp_path):
     options = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}}
     model = small_model(env, role_keys={"learner": list(space.spaces)}, buffer_size=60, policy_kwargs=options).learn(14)
     model.save(tmp_path / "model")
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
     assert [entry["name"] for entry in learner.metadata["entries"]] == list(space.spaces)
     assert {value.name for value in learner._session.get_inputs()} == set(space.spaces)
     observation = {key: value[None] for key, value in space.sample().items()}
@@ -370,7 +370,7 @@ def test_the_guider_names_what_it_lacks(reads_all):
 def test_the_learner_on_the_robot_refuses_choices_that_there_are_not(tmp_path):
     space = spaces.Dict(partial=VECTOR, gear=KINDS["choice from 1"], table=KINDS["table"], lidar=KINDS["lidar"])
     model = small_model(Sampled(space), role_keys={"learner": list(space.spaces)}, buffer_size=20)
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
     said = {entry["name"]: entry for entry in learner.metadata["entries"]}
     assert (said["gear"]["smallest"], said["gear"]["largest"], said["gear"]["n"]) == (1, 4, 4)
     assert (said["table"]["smallest"], said["table"]["largest"]) == ([[5, 0], [-1, 2]], [[7, 3], [0, 3]])

@@ -16,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_gac
-from sb3_gac import GAC, AsymmetricSAC, DeploymentNormalizer, Learner, export_learner
+from sb3_gac import GAC, AsymmetricSAC, DeploymentNormalizer, OnnxPolicy, export_learner
 from sb3_gac.deploy.verification import ExportError, draw_observations
 from sb3_gac.envs import History
 from sb3_gac.networks.encoders import VectorExtractor
@@ -98,7 +98,7 @@ def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
     raw = _drawn(model, 10_000, seed=1)
     expected, _ = model.predict(_normalised_as_in_training(model, raw), deterministic=True)
     if suffix == ".onnx":
-        actual = Learner.load(path).act(raw)
+        actual = OnnxPolicy.load(path).act(raw)
     else:
         extra = {"sb3_gac": ""}
         actual = th.jit.load(str(path), _extra_files=extra)(*map(th.as_tensor, raw.values())).numpy()
@@ -118,7 +118,7 @@ def test_a_memory_is_carried_and_reset(kind, tmp_path):
     """500 sequences of 20 observations, twice."""
     model = WITH_MEMORY[kind]().learn(60)
     unlike_each_other(model.policy, scale=0.2 if "image" in kind else 1.0)
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx"))
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx"))
     script = th.jit.load(str(export_learner(model, tmp_path / "learner.pt")))
     sequence = [_drawn(model, 500, seed=step) for step in range(20)]
     for _ in range(2):
@@ -141,7 +141,7 @@ def test_a_memory_is_carried_and_reset(kind, tmp_path):
 def test_what_the_file_says_of_itself(tmp_path):
     model = small_model(Scaled()).learn(20)
     path = export_learner(model, tmp_path / "learner.onnx", units={"partial": "m", "action": "N m"})
-    said = Learner.load(path).metadata
+    said = OnnxPolicy.load(path).metadata
     nothing = [None, None]
     partial = {"name": "partial", "shape": [2], "dtype": "float32", "unit": "m", "low": nothing, "high": nothing}
     assert said["entries"] == [partial]
@@ -156,7 +156,7 @@ def test_what_the_file_says_of_itself(tmp_path):
 
 
 def test_what_a_file_with_memory_and_choices_says(tmp_path):
-    said = Learner.load(export_learner(WITH_MEMORY["recurrent"]().learn(60), tmp_path / "learner.onnx")).metadata
+    said = OnnxPolicy.load(export_learner(WITH_MEMORY["recurrent"]().learn(60), tmp_path / "learner.onnx")).metadata
     assert said["memory"] == {"input": "state", "output": "next_state", "size": 8, "initial": 0.0}
     assert said["action"]["n"] == 3
     assert said["action"]["meaning"].startswith("number of the most probable action")
@@ -167,7 +167,7 @@ def test_entries_of_any_name(tmp_path):
     names = {"partial": "action", "privileged": "robot.state"}
     env = VecNormalize(make_vec_env(lambda: Renamed(TwoViewBandit(), names), 1))
     model = small_model(env, role_keys={"learner": list(names.values())}).learn(30)
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx", units={"action": "m", "action_": "N"}))
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx", units={"action": "m", "action_": "N"}))
     assert (learner.metadata["entries"][0]["unit"], learner.metadata["action"]["unit"]) == ("m", "N")
     raw = {"action": np.ones(2), "robot.state": np.ones(1)}
     expected, _ = model.predict(env.normalize_obs(raw), deterministic=True)
@@ -214,7 +214,7 @@ def test_a_file_that_acts_otherwise_is_not_written(tmp_path):
 def test_a_memory_that_is_not_carried_on_is_noticed(tmp_path, monkeypatch):
     model = WITH_MEMORY["recurrent, continuous"]().learn(50)
     unlike_each_other(model.policy)
-    monkeypatch.setattr(Learner, "_remembered", lambda self, n: np.zeros((n, self._memory["size"]), np.float32))
+    monkeypatch.setattr(OnnxPolicy, "_remembered", lambda self, n: np.zeros((n, self._memory["size"]), np.float32))
     with pytest.raises(ExportError, match="differ from those of predict"):
         export_learner(model, tmp_path / "learner.onnx")
 
@@ -223,9 +223,9 @@ def test_a_memory_that_is_not_carried_on_is_noticed(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("error", "is_written"), [(1e-4, False), (2e-6, True)])
 def test_how_much_actions_may_differ(kind, error, is_written, tmp_path, monkeypatch):
     """In units of half their range."""
-    model, act = KINDS[kind](), Learner.act
+    model, act = KINDS[kind](), OnnxPolicy.act
     half = (model.action_space.high - model.action_space.low) / 2
-    monkeypatch.setattr(Learner, "act", lambda self, observation: act(self, observation) + error * half)
+    monkeypatch.setattr(OnnxPolicy, "act", lambda self, observation: act(self, observation) + error * half)
     with nullcontext() if is_written else pytest.raises(ExportError):
         export_learner(model, tmp_path / "learner.onnx")
     assert (tmp_path / "learner.onnx").exists() == is_written
@@ -267,9 +267,9 @@ for name in {missing}:
     sys.modules[name] = None  # importing it fails
 find = importlib.util.find_spec
 importlib.util.find_spec = lambda name, *args: None if name in {missing} else find(name, *args)
-from sb3_gac.learner import Learner
+from sb3_gac.learner import OnnxPolicy
 import numpy as np
-print(Learner.load({str(path)!r}).act(np.zeros(2)).shape)
+print(OnnxPolicy.load({str(path)!r}).act(np.zeros(2)).shape)
 """
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert result.stdout.strip() == "(1,)", result.stderr
@@ -277,9 +277,9 @@ print(Learner.load({str(path)!r}).act(np.zeros(2)).shape)
 
 def test_one_module_is_all_that_the_robot_needs(tmp_path):
     path = export_learner(small_model(TwoViewBandit()).learn(20), tmp_path / "learner.onnx")
-    shutil.copy(sys.modules[Learner.__module__].__file__, tmp_path / "learner.py")
+    shutil.copy(sys.modules[OnnxPolicy.__module__].__file__, tmp_path / "learner.py")
     without = "import sys; sys.modules['sb3_gac'] = sys.modules['torch'] = None"
-    program = f"{without}; from learner import Learner; Learner.load({str(path)!r})"
+    program = f"{without}; from learner import OnnxPolicy; OnnxPolicy.load({str(path)!r})"
     subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
 
 
@@ -298,7 +298,7 @@ def test_one_module_is_all_that_the_robot_needs(tmp_path):
     ],
 )
 def test_bad_observations(observation, message, tmp_path):
-    learner = Learner.load(export_learner(small_model(TwoViewBandit()).learn(20), tmp_path / "learner.onnx"))
+    learner = OnnxPolicy.load(export_learner(small_model(TwoViewBandit()).learn(20), tmp_path / "learner.onnx"))
     with pytest.raises(ValueError, match=message):
         learner.act(observation)
 
@@ -307,7 +307,7 @@ def test_entries_of_several_kinds_together(tmp_path):
     """Each must be of the type and as many as the others."""
     space = spaces.Dict(image=spaces.Box(0, 255, (3, 36, 36), np.uint8), gear=spaces.Discrete(3), privileged=VECTOR)
     model = small_model(Sampled(space), role_keys={"learner": ["image", "gear"]}, policy_kwargs=CNN).learn(30)
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx"))
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx"))
     assert learner.metadata["entries"][1]["layout"] == "channels first"
     rows = [space.sample() for _ in range(5)]
     batch = {key: np.stack([row[key] for row in rows]) for key in ("image", "gear")}
@@ -335,7 +335,7 @@ def test_entries_of_several_kinds_together(tmp_path):
 def test_entries_of_any_kind(space, tmp_path):
     """Verified at export, on observations of that kind."""
     model = small_model(Sampled(spaces.Dict(partial=space, privileged=VECTOR)))
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx"))
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx"))
     export_learner(model, tmp_path / "learner.pt")
     drawn = draw_observations(model.policy.learner, None, 1)["partial"][0]
     np.testing.assert_allclose(learner.act(drawn), model.predict({"partial": drawn}, deterministic=True)[0], atol=1e-5)
@@ -350,7 +350,7 @@ def test_bad_files(tmp_path):
         export_learner(small_model(TwoViewBandit()), tmp_path / "learner.zip")
     (tmp_path / "other.onnx").write_bytes(b"something else")
     with pytest.raises(ValueError, match="is not an ONNX file"):
-        Learner.load(tmp_path / "other.onnx")
+        OnnxPolicy.load(tmp_path / "other.onnx")
 
 
 def test_public_names_are_found_and_listed():

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, InvalidStepError, Learner, export_learner
+from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, InvalidStepError, OnnxPolicy, export_learner
 from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
 
 ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
@@ -165,7 +165,7 @@ def test_other_box_actions_are_stored_as_they_were_taken(cls, dtype, shape, tmp_
     stored = model.replay_buffer.actions[:30].reshape(30, *shape)
     np.testing.assert_allclose(stored, scaled, atol=1e-6)
     assert noise is None or (np.abs(stored[10:]) == 1).any()  # where rounding would lead beyond the bounds
-    learner = Learner.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx", verify_on=8))
     given = np.float32([[0.3, -0.2], [2, 3]])
     actions, expected = learner.act(given), model.predict(given, deterministic=True)[0]
     assert actions.dtype == expected.dtype == dtype

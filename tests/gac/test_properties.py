@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, Learner, export_learner
+from sb3_gac import GAC, OnnxPolicy, export_learner
 
 PROPERTIES = settings(
     max_examples=15,
@@ -139,7 +139,7 @@ def test_the_buffer_holds_what_the_environments_returned(space, actions, n_envs,
     action, _ = model.predict(seen, deterministic=True)
     assert actions.contains(action if isinstance(actions, spaces.Box) else np.int64(action))
     with tempfile.TemporaryDirectory() as directory:
-        learner = Learner.load(export_learner(model, f"{directory}/learner.onnx", verify_on=4))
+        learner = OnnxPolicy.load(export_learner(model, f"{directory}/learner.onnx", verify_on=4))
     exported = learner.act(seen)
     assert actions.contains(exported)
     np.testing.assert_allclose(exported, action, rtol=1e-4, atol=1e-3)
@@ -187,7 +187,7 @@ def test_any_entry_of_any_name_is_read_by_a_memory_and_exported(partial, other, 
             with pytest.raises(ValueError, match="no file can name an entry with a null character"):
                 export_learner(model, f"{directory}/learner.onnx", verify_on=4)
             return
-        learner = Learner.load(export_learner(model, f"{directory}/learner.onnx", verify_on=4))
+        learner = OnnxPolicy.load(export_learner(model, f"{directory}/learner.onnx", verify_on=4))
     state = None
     for _ in range(3):
         seen = space.sample()

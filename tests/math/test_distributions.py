@@ -159,12 +159,12 @@ def test_categorical_expectations_and_losses(dtype):
     noise = th.zeros(())
     kl = guider.kl(learner)
     assert_close(kl, case["kl"])
-    q_guided, log_prob = guider.expectation(lambda actions: case["q_guided"], noise)
+    q_guided, log_prob = guider.value_and_log_prob(lambda actions: case["q_guided"], noise)
     assert_close(-log_prob, case["entropy_guider"])
     kl_coef, ent_coef = case["kl_coef"], case["ent_coef"]
     extra = {"log_prob": log_prob, "ent_coef": ent_coef}
     assert_close(policy_loss(q=q_guided, kl=kl, kl_coef=kl_coef, **extra), case["guider_loss_eq13"])
-    q_learner, _ = learner.expectation(lambda actions: case["q_learner"], noise)
+    q_learner, _ = learner.value_and_log_prob(lambda actions: case["q_learner"], noise)
     assert_close(policy_loss(q=q_learner, kl=kl, kl_coef=kl_coef), case["learner_loss_eq16"])
     given = {"reward": case["reward"], "done": case["done"], "discount": case["gamma"]}
     extra = {"next_log_prob": log_prob, "ent_coef": ent_coef, "next_kl": kl, "kl_coef": kl_coef}
@@ -183,8 +183,8 @@ def test_categorical_corrections_samples_and_modes():
     th.manual_seed(0)
     logits = th.tensor([1.0, 0.0, -1.0], requires_grad=True)
     learner = Categorical(logits)
-    assert th.equal(learner.corrected(Categorical(th.zeros(3))).logits, logits)
-    corrected = learner.corrected(Categorical(th.tensor([0.0, 3.0, 0.0], requires_grad=True)))
+    assert th.equal(learner.with_residual(Categorical(th.zeros(3))).logits, logits)
+    corrected = learner.with_residual(Categorical(th.tensor([0.0, 3.0, 0.0], requires_grad=True)))
     assert corrected.mode.item() == 1
     assert th.autograd.grad(corrected.logits.sum(), logits, allow_unused=True)[0] is None, "the learner is a constant"
     samples = Categorical(logits.detach().expand(20_000, 3)).sample()

@@ -5,14 +5,14 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_gac.networks.recurrent import Memory
+from sb3_gac.networks.recurrent import RecurrentCore
 
 
 @pytest.mark.parametrize("cell", ["gru", "lstm"])
 @pytest.mark.parametrize("net_arch", [[], [5]])
 def test_step_by_step_as_at_once(cell, net_arch):
     th.manual_seed(0)
-    memory = Memory(cell, 3, net_arch, 4, n_members=2)
+    memory = RecurrentCore(cell, 3, net_arch, 4, n_members=2)
     x = th.randn(6, 7, 3)
     outputs, last = memory(x)
     assert outputs.shape == (2, 6, 7, 4)
@@ -25,7 +25,7 @@ def test_step_by_step_as_at_once(cell, net_arch):
 
 @pytest.mark.parametrize(("cell", "module"), [("gru", nn.GRUCell), ("lstm", nn.LSTMCell)])
 def test_members_are_torchs_cells(cell, module):
-    memory = Memory(cell, 3, [], 4, n_members=2)
+    memory = RecurrentCore(cell, 3, [], 4, n_members=2)
     x = th.randn(5, 2, 3)
     for member in range(2):
         reference = module(3, 4)
@@ -38,7 +38,7 @@ def test_members_are_torchs_cells(cell, module):
 
 
 def test_an_episodes_start_forgets():
-    memory = Memory("gru", 3, [], 4)
+    memory = RecurrentCore("gru", 3, [], 4)
     state = np.ones((3, 4), dtype=np.float32)
     before = memory.state_before(state, np.array([True, False, True]), batch=3)
     assert before[0].sum(dim=1).tolist() == [0, 4, 0]

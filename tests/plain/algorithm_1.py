@@ -25,7 +25,7 @@ class Gaussian(NamedTuple):
     mean: th.Tensor
     std: th.Tensor
 
-    def expectation(self, q: Critics, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def value_and_log_prob(self, q: Critics, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """The smallest critic's value of one action, and its log-density."""
         x = self.mean + self.std * noise
         action = th.tanh(x)
@@ -47,7 +47,7 @@ class Choice(NamedTuple):
 
     logits: th.Tensor
 
-    def expectation(self, q: Critics, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def value_and_log_prob(self, q: Critics, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Of each action the smallest critic's value, and the log-probability, weighted by how likely it is."""
         distribution = th.distributions.Categorical(logits=self.logits)
         return (distribution.probs * th.stack(q(None)).amin(dim=0)).sum(dim=-1), -distribution.entropy()
@@ -269,18 +269,18 @@ class PlainGAC(PlainAlgorithm):
         with th.no_grad():
             next_mu, next_pi = self.policies(guider_outputs[1], learner_outputs[1])
             # Eq. 12
-            q, log_prob = next_mu.expectation(self.q(self.theta_bar, batch, later=True), noise[0])
+            q, log_prob = next_mu.value_and_log_prob(self.q(self.theta_bar, batch, later=True), noise[0])
             y_theta = batch.rewards + future * (q - alpha * next_mu.kl(next_pi, reduction) - beta * log_prob)
             # Eq. 15
             if self.phi_bar is not None:
-                q, log_prob = next_pi.expectation(self.q(self.phi_bar, batch, later=True), noise[2])
+                q, log_prob = next_pi.value_and_log_prob(self.q(self.phi_bar, batch, later=True), noise[2])
                 y_phi = batch.rewards + future * (q - beta_of_learner * log_prob)
         self.fit_critics("guider_critic", batch, y_theta)
         if self.phi_bar is not None:
             self.fit_critics("learner_critic", batch, y_phi)
         # Eq. 13
         kl = mu.kl(pi.detach(), reduction)
-        q, log_prob = mu.expectation(self.q(self.theta, batch), noise[1])
+        q, log_prob = mu.value_and_log_prob(self.q(self.theta, batch), noise[1])
         guider_loss = batch.mean(alpha * kl + beta * log_prob - q)
         self.descend("guider", guider_loss)
         # Eq. 16, or 14
@@ -299,7 +299,7 @@ class PlainGAC(PlainAlgorithm):
 
     def learner_loss(self, batch: Batch, mu: Any, pi: Any, noise: th.Tensor, alpha: Any, beta: Any) -> th.Tensor:
         """Eq. 16; of GACShare phi is theta."""
-        q, log_prob = pi.expectation(self.q(self.phi, batch), noise)
+        q, log_prob = pi.value_and_log_prob(self.q(self.phi, batch), noise)
         kl = mu.kl(pi, self.settings.kl_reduction)
         return batch.mean(self.settings.pull * alpha * kl + beta * log_prob - q)
 
@@ -344,10 +344,10 @@ class PlainSAC(PlainAlgorithm):
         beta, critics, targets = self.beta.value, self.networks["critic"], self.targets["critic_target"]
         now, later = (self.distribution(outputs) for outputs in self.outputs(self.networks["actor"], batch))
         with th.no_grad():
-            q, log_prob = later.expectation(self.q(targets, batch, later=True), noise[0])
+            q, log_prob = later.value_and_log_prob(self.q(targets, batch, later=True), noise[0])
             y = batch.rewards + batch.discounts * (1 - batch.terminated) * (q - beta * log_prob)
         self.fit_critics("critic", batch, y)
-        q, log_prob = now.expectation(self.q(critics, batch), noise[1])
+        q, log_prob = now.value_and_log_prob(self.q(critics, batch), noise[1])
         actor_loss = batch.mean(beta * log_prob - q)
         self.descend("actor", actor_loss)
         self.logged |= self.beta.update(batch.mean(log_prob) + self.settings.target_entropy)

@@ -339,14 +339,14 @@ def _add(buffer, reward, done=False):
 
 def test_no_sum_of_rewards_crosses_a_cut():
     buffer = _make(10, 2, n_steps=3, gamma=1.0)
-    buffer.cut()
+    buffer.mark_reset()
     for reward in (1.0, 1.0, 1.0):
         _add(buffer, reward)
-    buffer.cut()
-    buffer.cut()
+    buffer.mark_reset()
+    buffer.mark_reset()
     for reward in (100.0, 100.0):
         _add(buffer, reward, done=True)
-    buffer.cut()
+    buffer.mark_reset()
     assert set(buffer.sample(200).rewards.flatten().tolist()) == {3.0, 2.0, 1.0, 100.0}
     assert buffer.endings[:5, 0].tolist() == [0, 0, 4, 1, 1]
     assert len(buffer._finals) == 2 * 3
@@ -468,7 +468,7 @@ def test_a_step_whose_storing_was_interrupted_is_as_if_it_had_not_been(kind, mon
     with pytest.raises(KeyboardInterrupt):
         buffer.add(b, c, np.zeros((2, 1)), np.zeros(2), np.ones(2, bool), [{}, {}])
     monkeypatch.undo()
-    buffer.cut()
+    buffer.mark_reset()
     buffer.add(c, d, np.zeros((2, 1)), np.zeros(2), np.ones(2, bool), [{}, {}])
     assert buffer.pos == 2
     np.testing.assert_array_equal(buffer.next_observations["ticks"][:2, 0, 0], [1.0, 3.0])

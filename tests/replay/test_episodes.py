@@ -162,10 +162,10 @@ def test_a_cut_ends_an_episode_even_where_no_observation_tells():
     constant = Recorder._entries([0.0, 0.0])
     for step in range(7):
         if step in (3, 5):
-            buffer.cut()
+            buffer.mark_reset()
         done = np.array([step == 4, False])
         buffer.add(constant, constant, np.zeros((2, 1)), np.zeros(2), done, [{}, {}])
-    buffer.cut()
+    buffer.mark_reset()
     whole = [[0, 0, 3], [1, 0, 3], [0, 3, 2], [1, 3, 2], [0, 5, 2], [1, 5, 2]]
     assert buffer._episodes.since(0).tolist() == whole
     buffer.add(constant, constant, np.zeros((2, 1)), np.zeros(2), np.ones(2), [{}, {}])
