@@ -13,9 +13,9 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import GAC, TGRL, AsymmetricSAC, GACShare, GACWithoutQ
 from tests.helpers import gradient_step, noise_of_step, unlike_each_other
-from tests.plain.algorithm_1 import PlainGAC, PlainGACWithoutQ, PlainSAC, Settings
+from tests.plain.algorithm_1 import PlainGAC, PlainGACWithoutQ, PlainSAC, PlainTGRL, Settings
 from tests.plain.replay import PlainReplay, Recorded
 
 BOUNDS = (-1.2, 0.4)
@@ -23,7 +23,7 @@ SIZES = {"net_arch": [8, 6], "log_std_bounds": BOUNDS}
 MEMORY = {"net_arch": [6], "rnn_hidden_size": 5, "rnn_net_arch": [6]}
 SHARED = {"learning_rate": 0.01, "gamma": 0.9, "tau": 0.1, "ent_coef": "auto_0.3", "target_entropy": -0.7}
 GUIDED = {"target_kl": 0.2, "kl_coef": "auto_2.0", "kl_coef_bounds": (0.5, 8.0), "kl_coef_learning_rate": 0.05}
-PLAIN = {GAC: PlainGAC, GACShare: PlainGAC, GACWithoutQ: PlainGACWithoutQ, AsymmetricSAC: PlainSAC}
+PLAIN = {GAC: PlainGAC, GACShare: PlainGAC, GACWithoutQ: PlainGACWithoutQ, AsymmetricSAC: PlainSAC, TGRL: PlainTGRL}
 
 
 @dataclass
@@ -110,6 +110,15 @@ CASES = {
     "GRU, SAC, discrete": Case(AsymmetricSAC, cell="Gru", discrete=True),
     "LSTM, normalised": Case(GAC, cell="Lstm", normalised=True),
     "LSTM, share, discrete": Case(GACShare, {}, {"pull": 1.0}, cell="Lstm", discrete=True),
+    "GRU for the learner alone": Case(GAC, of_model={"policy_kwargs": {"rnn_type": {"learner": "gru"}}}, cell="Gru"),
+    "GRU for critics alone": Case(GAC, of_model={"policy_kwargs": {"rnn_type": {"critic": "gru"}}}, cell="Gru"),
+    "TGRL": Case(TGRL, {"teacher_coef": 0.6}),
+    "TGRL, clipped, n steps": Case(TGRL, CLIPPED | {"teacher_coef": 2.0}, of_model=N_STEPS),
+    "TGRL, discrete": Case(TGRL, {"teacher_coef": 0.6, "target_entropy": 0.8}, discrete=True),
+    "TGRL, GRU": Case(TGRL, {"teacher_coef": 0.6}, cell="Gru"),
+    "TGRL, GRU for actors alone": Case(
+        TGRL, of_model={"policy_kwargs": {"rnn_type": dict.fromkeys(("actor", "auxiliary"), "gru")}}, cell="Gru"
+    ),
     "LSTM, SAC, normalised": Case(AsymmetricSAC, cell="Lstm", normalised=True),
 }
 
@@ -128,6 +137,10 @@ def _model(case, settings, arguments):
     arguments = {"max_grad_norm": settings.max_grad_norm, **arguments}
     arguments.pop("optimizer", None)
     sizes = {"optimizer_class": settings.optimizer, **(MEMORY if case.cell else SIZES), "log_std_bounds": BOUNDS}
+    of_model = dict(case.of_model)
+    sizes |= of_model.pop("policy_kwargs", {})
+    if case.cls is TGRL:
+        of_model["teacher"] = _teacher(case)
     model = case.cls(
         f"MultiInput{case.cell}Policy",
         vec_env,
@@ -138,10 +151,17 @@ def _model(case, settings, arguments):
         seed=0,
         device="cpu",
         **arguments,
-        **case.of_model,
+        **of_model,
     ).learn(80)
     unlike_each_other(model.policy)
     return model, envs
+
+
+def _teacher(case):
+    role_keys = {"actor": ["partial", "privileged"]}
+    teacher = AsymmetricSAC("MultiInputPolicy", Recorded(case.discrete), role_keys=role_keys, policy_kwargs=SIZES, seed=1)
+    unlike_each_other(teacher.policy)
+    return teacher
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -149,7 +169,8 @@ def test_a_gradient_step_is_the_plain_one(name):
     case = CASES[name]
     settings, arguments = _settings(case)
     model, envs = _model(case, settings, arguments)
-    plain = PLAIN[case.cls](model.policy, settings)
+    frozen = [frozen.policy.actor for frozen in model.frozen.values()]
+    plain = PLAIN[case.cls](model.policy, settings, *frozen)
     length = case.of_model.get("replay_buffer_kwargs", {}).get("sequence_length")
     replay = PlainReplay(envs, model.get_vec_normalize_env(), case.of_model.get("n_steps", 1), settings.gamma, length)
     if case.cls in (GACShare, GACWithoutQ):

@@ -68,7 +68,7 @@ class DeployedModule(nn.Module):
         return self._free(f"{name}_") if name in self.keys else name
 
     @property
-    def memory(self) -> Memory | None:
+    def memory(self) -> RecurrentCore | None:
         """Of a recurrent policy."""
         return self.policy.memory  # type: ignore[return-value]
 

@@ -15,8 +15,8 @@ class RoleModel(BaseModel):
     """
     A network that reads only the observation entries of its role, whatever else the observation holds.
 
-    With a ``memory`` (:class:`sb3_gac.networks.recurrent.RecurrentCore`) it needs sequences from an episode's start on, (T, B, ...)
-    of each entry instead of (B, ...); without one it takes either.
+    With a ``memory`` (:class:`sb3_gac.networks.recurrent.RecurrentCore`) it needs sequences from an episode's start on,
+    (T, B, ...) of each entry instead of (B, ...); without one it takes either.
 
     Where the learner's encoder is shared, ``features_extractor`` is the learner's, which the learner's loss alone
     trains, and ``rest_extractor`` encodes the entries that the learner does not read.

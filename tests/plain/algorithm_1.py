@@ -112,6 +112,7 @@ class Settings:
     shared_std: str = "learner"
     pull: float = 0.0
     learner_entropy: bool = True
+    teacher_coef: float = 1.0
     max_grad_norm: float | None = None
     target_update_interval: int = 1
     optimizer: type[th.optim.Optimizer] = th.optim.SGD
@@ -354,3 +355,59 @@ class PlainSAC(PlainAlgorithm):
         self.update_targets()
         self.logged |= {"actor_loss": actor_loss, "entropy": -batch.mean(log_prob)}
         return self.logged | self.described("actor", now, batch)
+
+
+class PlainTGRL(PlainAlgorithm):
+    """
+    Teacher-Guided RL.
+
+    :param policy: of the model
+    :param settings: of the model
+    :param teacher: its actor, copied
+    """
+
+    n_noises = 4
+
+    def __init__(self, policy: Any, settings: Settings, teacher: Any):
+        super().__init__(policy, ["reward_critic", "teacher_critic", "actor", "auxiliary"], settings)
+        self.teacher = plain_policy(teacher)
+
+    @staticmethod
+    def distance(pi: Any, teacher: Any) -> th.Tensor:
+        """KL(pi || teacher) before tanh, of any two."""
+        if isinstance(pi, Choice):
+            return pi.kl(teacher, "sum")
+        normals = [th.distributions.Normal(one.mean, one.std) for one in (pi, teacher)]
+        return th.distributions.kl_divergence(*normals).sum(dim=-1)
+
+    def step(self, batch: Batch, noise: th.Tensor) -> dict[str, th.Tensor]:
+        """
+        :param batch: of transitions or sequences
+        :param noise: standard normal: of the main actor's next action for either critic, of the actors' present ones
+        :return: what is to be logged
+        """
+        beta, c, nets = self.beta.value, self.settings.teacher_coef, self.networks
+        future = batch.discounts * (1 - batch.terminated)
+        (pi, next_pi), (pi_r, _), (asked, next_asked) = (
+            [self.distribution(outputs) for outputs in self.outputs(network, batch)]
+            for network in (nets["actor"], nets["auxiliary"], self.teacher)
+        )
+        with th.no_grad():
+            q_r, log_prob = next_pi.value_and_log_prob(self.q(self.targets["reward_critic_target"], batch, True), noise[0])
+            q_i, _ = next_pi.value_and_log_prob(self.q(self.targets["teacher_critic_target"], batch, True), noise[1])
+            y_r = batch.rewards + future * (q_r - beta * log_prob)
+            y_i = future * (q_i - self.distance(next_pi, next_asked))
+        self.fit_critics("reward_critic", batch, y_r)
+        self.fit_critics("teacher_critic", batch, y_i)
+        q_r, log_prob = pi.value_and_log_prob(self.q(nets["reward_critic"], batch), noise[2])
+        q_i, _ = pi.value_and_log_prob(self.q(nets["teacher_critic"], batch), noise[2])
+        distance = self.distance(pi, asked)
+        actor_loss = batch.mean(beta * log_prob - q_r + c * (distance - q_i))
+        self.descend("actor", actor_loss)
+        q_r, log_prob_of_auxiliary = pi_r.value_and_log_prob(self.q(nets["reward_critic"], batch), noise[3])
+        auxiliary_loss = batch.mean(beta * log_prob_of_auxiliary - q_r)
+        self.descend("auxiliary", auxiliary_loss)
+        self.logged |= self.beta.update(batch.mean(log_prob) + self.settings.target_entropy)
+        self.update_targets()
+        self.logged |= {"actor_loss": actor_loss, "auxiliary_loss": auxiliary_loss, "entropy": -batch.mean(log_prob)}
+        return self.logged | {"kl_to_teacher": batch.mean(distance), "ent_coef": self.beta.value}
