@@ -16,10 +16,8 @@ import sb3_gac
 from benchmarks.contenders import timer
 from benchmarks.models import make_model, matmul_rate, step_flops
 
-COMPILED = ("optim/compile.py", "on_inputs")
+COMPILED = ("optim/compile.py", "__call__")  # losses, gradients, clipping, optimisers and dual variables
 PARTS = {  # of a compiled gradient step -> file and function, none of which calls another
-    "optimisers": ("base/update.py", "_step"),  # the networks'; the dual variables have theirs among their own
-    "dual variables": ("optim/coefficients.py", "update"),
     "targets": ("base/policy.py", "update_targets"),
     "sampling": ("replay/buffer.py", "sample"),
 }

@@ -153,7 +153,7 @@ def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
 
 def optimizers_of(policy: Any) -> list[Any]:
     """Of all its networks."""
-    return [getattr(policy, name).optimizer for name in policy.flat_parameters]
+    return [getattr(policy, name).optimizer for name in policy.trained]
 
 
 def unlike_each_other(policy: Any, scale: float = 0.4, seed: int = 0) -> None:

@@ -153,10 +153,12 @@ class DataCollection(OffPolicyAlgorithm):
         assert isinstance(self._last_obs, dict)
         self._last_original_obs = self.replay_source.observation(self._last_obs)
         self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
-        self.acting = [str(self.policy.roles.behaviour)] * self.env.num_envs  # type: ignore[union-attr]
-        self._returns_so_far = np.zeros(self.env.num_envs)
-        self._has_warmed_up = np.zeros(self.env.num_envs, dtype=bool)
+        self._begin_episodes(self.env.num_envs)
         self._note_use()
+
+    def _begin_episodes(self, n_envs: int) -> None:
+        self.acting = [str(self.policy.roles.behaviour)] * n_envs  # type: ignore[union-attr]
+        self._returns_so_far, self._has_warmed_up = np.zeros(n_envs), np.zeros(n_envs, dtype=bool)
 
     def _note_use(self) -> None:
         """Whatever was done to the environments so far was done from here."""

@@ -342,14 +342,16 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         :return: action for the environments, and the same scaled to [-1, 1] for the buffer
         """
         warms_up = self.num_timesteps < learning_starts
-        assert self._last_episode_starts is not None
-        self.acting = self.choose_acting(self._last_episode_starts)
+        episode_starts = np.ones(n_envs, dtype=bool) if self._last_episode_starts is None else self._last_episode_starts
+        if len(self.acting) != n_envs:
+            self._begin_episodes(n_envs)
+        self.acting = self.choose_acting(episode_starts)
         self._has_warmed_up |= warms_up
         if warms_up and not self.is_recurrent:
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, dict)
         scaled_action, self._behaviour_state = self.policy.behaviour_action(
-            self._last_obs, self._behaviour_state, self._last_episode_starts, acting=self.acting
+            self._last_obs, self._behaviour_state, episode_starts, acting=self.acting
         )
         if warms_up:  # the memory was brought up
             return super()._sample_action(learning_starts, action_noise, n_envs)

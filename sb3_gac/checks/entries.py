@@ -127,6 +127,17 @@ def encode(values: th.Tensor, space: spaces.Space, normalize_images: bool) -> th
     return preprocess_obs(values, space, normalize_images=normalize_images)  # type: ignore[return-value]
 
 
+def leading_dimensions(values: th.Tensor, space: spaces.Space) -> int:
+    """
+    :param values: of an entry, (B, ...) or, of sequences, (T, B, ...)
+    :param space: of that entry
+    :return: 1 or 2
+    """
+    if isinstance(space, spaces.Discrete):  # (B,) where a policy acts, and with one more dimension from buffers
+        return max(values.dim() - 1, 1)
+    return values.dim() - len(space.shape)  # type: ignore[arg-type]
+
+
 def _one_hot(values: th.Tensor, n: Any, start: Any) -> th.Tensor:
     """Shape (B, n); zeros for what is none of the choices, such as the padding of a sequence."""
     return (values.long().unsqueeze(-1) == th.arange(int(start), int(start) + int(n), device=values.device)).float()

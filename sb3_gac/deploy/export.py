@@ -22,6 +22,7 @@ from sb3_gac.checks.values import check_positive, index_bounds
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import check_agreement, draw_observations
 from sb3_gac.networks.actors import DeployedPolicy
+from sb3_gac.networks.recurrent import RecurrentCore
 from sb3_gac.version import __version__
 
 ACTION, STATE, NEXT_STATE = "action", "state", "next_state"

@@ -7,7 +7,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_gac.checks.entries import encode
+from sb3_gac.checks.entries import encode, leading_dimensions
 from sb3_gac.networks.encoders import VectorExtractor
 
 
@@ -43,7 +43,7 @@ class RoleModel(BaseModel):
             return extractor(obs)
         entries = {key: obs[key] for key in space.spaces}  # type: ignore[index]
         key, value = next(iter(entries.items()))
-        leading = list(value.shape[: value.dim() - len(space[key].shape or ())])
+        leading = list(value.shape[: 2 if self.memory is not None else leading_dimensions(value, space[key])])
         if len(leading) > 1:  # encoders know one leading dimension, sequences have two
             entries = {key: value.flatten(0, 1) for key, value in entries.items()}
         features = extractor({key: encode(value, space[key], self.normalize_images) for key, value in entries.items()})

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from sb3_gac.optim.flat import FlatAdam, TrainedParameters
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac.optim.trained import TrainedParameters
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
 
 ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
@@ -62,7 +62,7 @@ def test_an_encoder_frozen_after_learning_stays_and_the_rest_trains_on(cls, poli
     assert _same(encoder, frozen)
     assert not any(parameter.requires_grad for parameter in encoder.parameters())
     assert _moved(deployed.latent_net, rest)
-    assert model.policy.frozen == tuple((model.policy.roles.deployed, i) for i in range(4))
+    assert model.policy.trained[model.policy.roles.deployed].trained[:5] == [False] * 4 + [True]
     encoder.requires_grad_(True)
     model.learn(5, reset_num_timesteps=False)
     assert _moved(encoder, frozen)
@@ -70,7 +70,7 @@ def test_an_encoder_frozen_after_learning_stays_and_the_rest_trains_on(cls, poli
 
 
 def _whole_networks(cls):
-    roles = small_model(cls=cls).policy.flat_parameters
+    roles = small_model(cls=cls).policy.trained
     return [pytest.param(cls, role, id=f"{cls.__name__}-{role}") for role in roles]
 
 
@@ -78,7 +78,7 @@ def _whole_networks(cls):
 @pytest.mark.parametrize("env", [TwoViewBandit, TwoViewChoice])
 def test_a_whole_network_frozen_after_construction_stays_and_the_others_train(cls, role, env):
     model = small_model(env(), cls)
-    networks = {name: getattr(model.policy, name) for name in model.policy.flat_parameters}
+    networks = {name: getattr(model.policy, name) for name in model.policy.trained}
     networks[role].requires_grad_(False)
     before = {name: _parameters(network) for name, network in networks.items()}
     model.learn(15)
@@ -131,37 +131,40 @@ def test_frozen_in_the_constructor_and_unfrozen_later():
     assert _moved(layer, before)
 
 
-def test_freezing_a_part_is_training_without_it():
-    """To the bit what an optimiser of the other parameters does, with momentum, clipping and weight decay."""
+@pytest.mark.parametrize("options", [{"fused": True}, {"foreach": True}], ids=["fast", "torch's own"])
+@pytest.mark.parametrize("optimizer_class", [th.optim.Adam, th.optim.AdamW])
+def test_freezing_a_part_is_training_without_it(optimizer_class, options):
+    """What an optimiser of the other parameters does, with momentum, clipping and weight decay; unfrozen, it starts anew."""
     th.manual_seed(0)
     network = nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 2))
     twin = deepcopy(network)
-    flat = TrainedParameters(list(network.parameters()))
-    ours = FlatAdam([{"params": [flat.flat]}], lr=0.01, weight_decay=0.1)
-    theirs = th.optim.Adam(twin.parameters(), lr=0.01, weight_decay=0.1)
+    ours = optimizer_class(network.parameters(), lr=0.01, weight_decay=0.1, **options)
+    trained = TrainedParameters(list(network.parameters()), ours)
+    assert trained.can_be_compiled == ("fused" in options)
+    theirs = [optimizer_class(layer.parameters(), lr=0.01, weight_decay=0.1) for layer in (twin[0], twin[2])]
     for step in range(9):
         if step in (3, 6):
             for one in (network, twin):
                 one[0].requires_grad_(step == 6)
-            flat.follow(ours)
-            if step == 6:  # joined by others, the optimiser starts anew
-                theirs = th.optim.Adam(twin.parameters(), lr=0.01, weight_decay=0.1)
-        flat.refresh()
+            if step == 6:
+                theirs[0] = optimizer_class(twin[0].parameters(), lr=0.01, weight_decay=0.1)
+        trained.refresh()
         x = th.randn(8, 3)
-        flat.flat.grad, norm = flat.gradient(network(x).square().sum(), max_norm=0.5)
-        ours.step()
-        theirs.zero_grad()
+        norm = trained.step(th.autograd.grad(network(x).square().sum(), trained.parameters), max_norm=0.5)
+        for optimizer in theirs:
+            optimizer.zero_grad()
         twin(x).square().sum().backward()
         th.testing.assert_close(norm, nn.utils.clip_grad_norm_([p for p in twin.parameters() if p.requires_grad], 0.5))
-        theirs.step()
+        for optimizer in theirs:
+            optimizer.step()
         for p, q in zip(network.parameters(), twin.parameters(), strict=True):
             th.testing.assert_close(p, q)
 
 
-def test_a_gradient_of_nothing_is_zero():
-    flat = TrainedParameters([nn.Parameter(th.zeros(2), requires_grad=False)])
-    gradient, norm = flat.gradient(th.zeros(()), max_norm=1.0)
-    assert (gradient.numel(), norm.item()) == (0, 0.0)
+def test_a_step_of_nothing_has_no_gradient():
+    nothing = nn.Parameter(th.zeros(2), requires_grad=False)
+    trained = TrainedParameters([nothing], th.optim.Adam([nothing], fused=True))
+    assert trained.step([], max_norm=1.0).item() == 0.0
 
 
 @pytest.mark.parametrize("optimizer", [(th.optim.SGD, {"momentum": 0.9}), (th.optim.AdamW, {}), (th.optim.RMSprop, {})])

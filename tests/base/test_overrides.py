@@ -122,7 +122,7 @@ GACS_OWN = {
     "target_kl": (0.02, lambda m: m.current_target_kl),
     "max_kl": (0.3, lambda m: m.policy.guider.max_kl),
     "kl_reduction": ("sum", lambda m: m.policy.guider.kl_reduction),
-    "learner_kl_scale": (0.5, lambda m: m.learner_pull),
+    "learner_kl_scale": (0.5, lambda m: m.learner_kl_weight),
 }
 
 

@@ -21,7 +21,7 @@ def _same(one, other):
 @pytest.mark.parametrize("env", [TwoViewBandit, TwoViewChoice])
 def test_targets_start_as_their_critics_and_stay_until_they_are_averaged(cls, env):
     policy = small_model(env(), cls).policy
-    for critic, target in policy.critic_pairs.values():
+    for critic, target in policy.pairs.values():
         assert _same(critic, target)
         members = next(iter(critic.parameters()))
         assert not th.equal(members[0], members[1]), "two critics, not one twice"
@@ -39,7 +39,7 @@ def test_a_targets_encoder_is_its_own_where_the_learners_is_shared(cls):
     """Or the target would follow the learner's loss at once, and not by averaging."""
     policy = small_model(Sampled(IMAGE), cls, policy_kwargs=CNN).policy
     of_deployed = {id(parameter) for parameter in policy.deployed.parameters()}
-    for critic, target in policy.critic_pairs.values():
+    for critic, target in policy.pairs.values():
         assert of_deployed & {id(parameter) for parameter in critic.parameters()}
         assert not of_deployed & {id(parameter) for parameter in target.parameters()}
         assert _same(critic, target)
@@ -49,9 +49,7 @@ def test_a_targets_encoder_is_its_own_where_the_learners_is_shared(cls):
 def test_policies_and_critics_may_differ_in_size(cls):
     policy = small_model(cls=cls, policy_kwargs={"net_arch": {"pi": [8], "qf": [4, 5]}}).policy
     assert policy.deployed.net_arch == [8]
-    assert [critic.net_arch for pair in policy.critic_pairs.values() for critic in pair] == [[4, 5]] * 2 * len(
-        policy.critic_pairs
-    )
+    assert [critic.net_arch for pair in policy.pairs.values() for critic in pair] == [[4, 5]] * 2 * len(policy.pairs)
 
 
 @pytest.mark.parametrize(("guider", "starts_at_the_learner"), [("residual", True), ("independent", False)])

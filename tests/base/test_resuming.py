@@ -98,7 +98,15 @@ class Succeeds(Recall):
 
 #: Attributes of a model that are not what training has done so far: other objects that do the same, or a process's own
 NOT_PROGRESS = {"env", "policy", "replay_buffer", "_logger", "start_time", "_vec_normalize_env", "action_noise", "_last_use"}
-OF_RESUMING = {"_saved_blocks", "_resumed_noise", "resumed_notes", "learn_scope", "program_key"}
+OF_RESUMING = {
+    "_saved_blocks",
+    "_resumed_noise",
+    "resumed_notes",
+    "learn_scope",
+    "_program_key",
+    "chooses_behaviour",
+    "frozen",
+}
 
 
 @pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])

@@ -93,10 +93,10 @@ def test_each_loss_moves_its_own_network():
         update()
         return {name.split(".")[0] for name, p in model.policy.named_parameters() if not th.equal(p, before[name])}
 
-    assert changed(lambda: model._step("critic", model._critic_descent("critic", batch, th.zeros(32)))) == {"critic"}
-    (now, _), backward = model._policy_pass("actor", batch)
-    slope, _ = model._actor_slope(batch, now, th.randn(32, 1), th.tensor(0.1))
-    assert changed(lambda: model._policy_step("actor", backward, slope)) == {"actor"}
+    (actor,) = model.outputs(batch, "actor")
+    noise, beta = th.randn(32, 1), th.tensor(0.1)
+    assert changed(lambda: model.minimize("critic", model.sac_critic_loss, batch, actor, noise, beta)) == {"critic"}
+    assert changed(lambda: model.minimize("actor", model.actor_loss, batch, actor, noise, beta)) == {"actor"}
 
 
 def test_learns_what_can_be_known_from_the_partial_view():

@@ -14,7 +14,6 @@ from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.models import LoopedGRU, recurrent_step_flops, step_flops
 from benchmarks.profiles import cumulative_seconds, env_step, profile_rollout, profile_step
 from benchmarks.speed import compare_buffers, compare_checkpoints, compare_deployment, compare_recurrent, compare_steps
-from sb3_gac.optim.flat import FlatAdam
 
 
 def test_arithmetic_of_a_step_by_hand():
@@ -108,21 +107,6 @@ def test_a_steps_parts_add_up():
     assert [row["part"].split(",")[0] for row in rows[:2]] == ["matrix products", "the rest inside compiled code"]
     assert sum(row["share"] for row in rows) == pytest.approx(1, abs=0.01)
     assert all(row["milliseconds"] > 0 for row in rows[1:])
-
-
-def test_a_dual_variables_optimiser_is_not_among_the_networks(monkeypatch):
-    """Of four networks and two dual variables."""
-    step = FlatAdam.step
-
-    def slow(optimizer):
-        time.sleep(0.02)
-        step(optimizer)
-
-    slow.hooked = True
-    monkeypatch.setattr(FlatAdam, "step", slow)
-    milliseconds = {row["part"]: row["milliseconds"] for row in profile_step("gac", (2, 3, 1), batch=8, width=8, steps=3)}
-    assert 4 * 20 <= milliseconds["optimisers"] < 6 * 20
-    assert 2 * 20 <= milliseconds["dual variables"] < 4 * 20
 
 
 def test_time_in_a_function_and_all_that_it_calls():

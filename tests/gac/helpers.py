@@ -2,13 +2,30 @@
 
 from typing import Any
 
-import torch as th
-
-from sb3_gac.base.update import Batch
-from sb3_gac.gac.update import StepInputs
+from sb3_gac.base.update import Batch, Step
 
 
-def learner_inputs(obs: Any, kl_coef: float = 1.0, ent_coef: float = 1.0) -> StepInputs:
-    """Of a gradient step, as far as the learner's loss looks at them."""
-    batch = Batch(obs, None, None, obs, None, 0.99)
-    return StepInputs(batch, None, None, None, th.tensor(kl_coef), th.tensor(ent_coef))
+def steps_of(model: Any, batch: Batch) -> list[Step]:
+    """What a gradient step of GAC minimises, in order, and nothing of it done yet."""
+    found: list[Step] = []
+
+    class StopHereError(Exception):
+        """Instead of the steps."""
+
+    def gather(*branches: Any) -> Any:
+        found.extend(step for branch in branches for step in branch if model.policy.has(step.network))
+        raise StopHereError
+
+    model.side_by_side = gather
+    try:
+        model.update(batch)
+    except StopHereError:
+        pass
+    finally:
+        del model.side_by_side
+    return found
+
+
+def batch_of(obs: Any) -> Batch:
+    """As far as the learner's loss looks at it."""
+    return Batch(obs, None, None, obs, None, 0.99)

@@ -73,17 +73,15 @@ def test_logged_values_are_means_over_the_gradient_steps():
     model = small_model(kl_coef=0.5)
     model.learn(30)
     history = []
-    original = model._gradient_step
-    model._gradient_step = lambda *args: history.append(original(*args)) or history[-1]
+    original = model.update
+    model.update = lambda *args: history.append(original(*args)) or history[-1]
     model.train(gradient_steps=5, batch_size=8)
     logged = model.logger.name_to_value
-    for name in ("guider_critic_loss", "learner_critic_loss", "learner_loss"):
+    for name in ("guider_critic_loss", "learner_critic_loss", "learner_loss", "kl_p95"):
         assert logged[f"train/{name}"] == pytest.approx(np.mean([step[name].item() for step in history]), rel=1e-5)
     assert logged["train/critic_loss"] == logged["train/guider_critic_loss"] + logged["train/learner_critic_loss"]
     assert logged["train/actor_loss"] == logged["train/learner_loss"]
     assert logged["train/kl_coef"] == 0.5
-    assert [("kl_p95" in step) for step in history] == [False] * 4 + [True], "diagnostics on the last step alone"
-    assert logged["train/kl_p95"] == history[-1]["kl_p95"].item()
 
 
 def test_targets_follow_at_their_interval():
@@ -104,7 +102,7 @@ def test_target_kl_may_shrink_over_training():
     model._current_progress_remaining = 0.75
     assert model.current_target_kl == pytest.approx(0.011)
     violations, update = [], model.kl_coef_dual.update
-    model.kl_coef_dual.update = lambda violation, mask: violations.append(violation) or update(violation, mask)
+    model.kl_coef_dual.update = lambda violation: violations.append(violation) or update(violation)
     model.train(gradient_steps=1, batch_size=8)
     kl, target = (model.logger.name_to_value[f"train/{name}"] for name in ("kl", "target_kl"))
     assert target == pytest.approx(0.011)
@@ -149,14 +147,14 @@ def test_learner_averages_over_what_it_cannot_see():
 def test_kl_settles_at_its_target():
     model = small_model(TwoViewBandit(noise_std=0.5), learning_rate=1e-3, batch_size=64, learning_starts=100, target_kl=0.02)
     kls = []
-    original = model._gradient_step
+    original = model.update
 
     def spy(*args):
         metrics = original(*args)
         kls.append(metrics["kl"].item())
         return metrics
 
-    model._gradient_step = spy
+    model.update = spy
     model.learn(2500)
     assert np.mean(kls[-500:]) == pytest.approx(0.02, rel=0.25)
 
@@ -220,7 +218,7 @@ def test_the_learners_update_is_that_of_sac_with_asymmetric_critics(monkeypatch)
         batch, noise = model._sample_batch(32), th.randn(2, 32, 1)
         monkeypatch.setattr(th, "randn", lambda shape, noise=noise, **_: th.cat([th.zeros_like(noise), noise])[-shape[0] :])
         for one in (model, sac):
-            one._gradient_step(batch)
+            one.update(batch)
             one.policy.update_targets(0.1)
         monkeypatch.undo()
     for ours, theirs in pairs:
@@ -237,8 +235,8 @@ def test_target_entropy_conventions():
 def test_optimizers_are_where_sac_has_them():
     model = small_model()
     for network in (model.actor, model.critic):
-        (flat,) = network.optimizer.param_groups[0]["params"]
-        th.testing.assert_close(flat, th.cat([p.flatten() for p in network.parameters()]), rtol=0, atol=0)
+        of_optimizer = network.optimizer.param_groups[0]["params"]
+        assert [id(p) for p in of_optimizer] == [id(p) for p in network.parameters()]
     assert model.policy.net_arch == [16]
 
 

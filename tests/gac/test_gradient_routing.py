@@ -1,5 +1,7 @@
 """Which loss moves which network: exactly those that it should, for every loss and every variant."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch as th
@@ -8,6 +10,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from sb3_gac import GAC, GACShare, GACWithoutQ
 from sb3_gac.math.distributions import TanhGaussian
 from sb3_gac.math.losses import critic_loss, distillation_loss, log_std_loss, policy_loss
+from tests.gac.helpers import steps_of
 from tests.helpers import small_model, unlike_each_other
 
 
@@ -133,10 +136,11 @@ def _filled(cls, **arguments):
 def test_updates_leave_the_other_networks_bit_for_bit(cls, critics):
     model = _filled(cls)
     batch = model._sample_batch(32)
-    (inputs, of_guider, of_learner), noise = model._run_policies(batch), th.randn(2, 32, 1)
-    own = critics & {"learner_critic"}
-    assert _changed_parts(model, lambda: model._guider_half(inputs, of_guider, noise)) == {"guider", "guider_critic"}
-    assert _changed_parts(model, lambda: model._learner_half(inputs, of_learner, noise)) == {"learner"} | own
+    steps = steps_of(model, batch)
+    assert {step.network for step in steps} == critics | {"guider", "learner"}
+    for network, loss, tensors in steps:
+        update = partial(model.minimize, network, loss, *tensors)
+        assert _changed_parts(model, update) == {network}
     targets = {f"{name}_target" for name in critics}
     assert _changed_parts(model, lambda: model.policy.update_targets(0.5)) == targets
 
@@ -145,10 +149,10 @@ def test_updates_leave_the_other_networks_bit_for_bit(cls, critics):
 def test_policy_updates_leave_no_gradient_in_the_critics(cls):
     model = _filled(cls)
     batch = model._sample_batch(32)
-    inputs, of_guider, of_learner = model._run_policies(batch)
-    model._policy_step("guider", of_guider, model._guider_slope(inputs, th.randn(32, 1))[0])
-    model._policy_step("learner", of_learner, model._learner_slope(inputs, th.randn(32, 1)))
-    assert all(p.grad is None for critic, _ in model.policy.critic_pairs.values() for p in critic.parameters())
+    for network, loss, tensors in steps_of(model, batch):
+        if "critic" not in network:
+            model.minimize(network, loss, *tensors)
+    assert all(p.grad is None for critic, _ in model.policy.pairs.values() for p in critic.parameters())
 
 
 def test_learner_has_no_gradient_with_respect_to_privileged():
@@ -183,18 +187,21 @@ def test_a_log_std_head_that_is_fitted_has_no_say_in_the_clipping_of_the_learner
     """Its gradient belongs to another loss: a huge one must not shrink the learner's."""
     model = _filled(GAC, max_grad_norm=1.0, shared_std="guider")
     head = list(model.policy.learner.head.log_std.parameters())
-    flat = model.policy.flat_parameters["learner"]
-    assert [id(p) for p in flat.parameters[-2:]] == [id(p) for p in head]
+    trained = model.policy.trained["learner"]
+    assert [id(p) for p in trained.parameters[-2:]] == [id(p) for p in head]
     obs = _observations()
-    mean, log_std = model.policy.learner.distribution(obs)
-    alone, _ = flat.gradient(0.01 * mean.sum(), max_norm=None)
-    assert 0 < alone.norm() < 1, "not clipped by itself"
-    mean, log_std = model.policy.learner.distribution(obs)
-    gradient, norm = flat.gradient(0.01 * mean.sum() + 1e6 * log_std.sum(), max_norm=1.0)
-    n_head = sum(p.numel() for p in head)
-    assert norm.item() == pytest.approx(alone.norm().item(), rel=1e-6)
-    th.testing.assert_close(gradient[:-n_head], alone[:-n_head])
-    assert gradient[-n_head:].norm() > 1e5, "its own is left as it is"
+    norms, gradients = [], []
+    for weight_of_head in (0.0, 1e6):
+        mean, log_std = model.policy.learner.distribution(obs)
+        loss = 0.01 * mean.sum() + weight_of_head * log_std.sum()
+        clipped, norm = trained._clip(th.autograd.grad(loss, trained.parameters), 1.0)
+        norms.append(norm.item())
+        gradients.append(clipped)
+    assert 0 < norms[0] < 1, "not clipped by itself"
+    assert norms[1] == pytest.approx(norms[0], rel=1e-6)
+    for alone, beside in zip(*(parts[:-2] for parts in gradients), strict=True):
+        th.testing.assert_close(beside, alone)
+    assert gradients[1][-1].norm() > 1e5, "its own is left as it is"
 
 
 class TestSharedEncoder:
@@ -227,22 +234,21 @@ class TestSharedEncoder:
         batch = model._sample_batch(32)
         encoder = model.policy.learner.features_extractor.linear.weight
         before = encoder.detach().clone()
-        (inputs, of_guider, of_learner), noise = model._run_policies(batch), th.randn(2, 32, 1)
-        model._guider_half(inputs, of_guider, noise)
-        model._step("learner_critic", model._learner_critic_descent(inputs, noise[0]))
-        assert th.equal(encoder, before)
-        model._learner_half(inputs, of_learner, noise)
+        for network, loss, tensors in steps_of(model, batch):
+            assert th.equal(encoder, before)
+            model.minimize(network, loss, *tensors)
+        assert network == "learner"
         assert not th.equal(encoder, before)
         guider = model.policy.distributions(batch.observations).guider
         assert "learner" not in _reached(model.policy, guider.mean.sum() + guider.log_std.sum())
 
     def test_is_optimised_once_and_followed_by_the_targets(self, model):
-        optimised = [id(p) for flat in model.policy.flat_parameters.values() for p in flat.parameters]
+        optimised = [id(p) for network in model.policy.trained.values() for p in network.parameters]
         assert len(optimised) == len(set(optimised))
         assert id(model.policy.learner.features_extractor.linear.weight) in optimised
-        model._gradient_step(model._sample_batch(32))
+        model.update(model._sample_batch(32))
         model.policy.update_targets(1.0)
-        critic, target = model.policy.critic_pairs["learner_critic"]
+        critic, target = model.policy.pairs["learner_critic"]
         assert all(th.equal(p, q) for p, q in zip(critic.parameters(), target.parameters(), strict=True))
 
     def test_saves_and_loads(self, model, tmp_path):

@@ -8,21 +8,21 @@ import torch as th
 from sb3_gac import GAC, GACShare, GACWithoutQ
 from sb3_gac.gac.policies import ActionDistributions
 from sb3_gac.math.distributions import TanhGaussian
-from tests.gac.helpers import learner_inputs
+from tests.gac.helpers import batch_of
 from tests.helpers import small_model
 
 
 @pytest.mark.parametrize(("guider", "scale"), [("residual", 0.0), ("independent", 1.0)])
 def test_the_pull_towards_the_guider_is_there_where_it_can_close_a_gap(guider, scale):
-    assert small_model(guider=guider).learner_pull == scale
-    assert small_model(guider=guider, learner_kl_scale=0.3).learner_pull == 0.3
+    assert small_model(guider=guider).learner_kl_weight == scale
+    assert small_model(guider=guider, learner_kl_scale=0.3).learner_kl_weight == 0.3
 
 
 def test_auto_is_saved_as_given_and_follows_the_guider(tmp_path):
     small_model().save(tmp_path / "model")
     for guider, pull in (("residual", 0.0), ("independent", 1.0)):
         loaded = GAC.load(tmp_path / "model", guider=guider)
-        assert (loaded.learner_kl_scale, loaded.learner_pull) == ("auto", pull)
+        assert (loaded.learner_kl_scale, loaded.learner_kl_weight) == ("auto", pull)
 
 
 def test_a_residual_guiders_kl_does_not_depend_on_the_learner():
@@ -51,7 +51,7 @@ def test_ablations_have_the_critics_that_they_should():
 
 def _learner_gradient(model, obs, kl_coef):
     now = model.policy.distributions(obs)
-    loss = model._learner_loss(learner_inputs(obs, kl_coef=kl_coef), now, th.zeros(32, 1))
+    loss = model.learner_objective(batch_of(obs), now, th.zeros(32, 1), th.tensor(kl_coef), th.tensor(1.0))
     return th.autograd.grad(loss, model.policy.learner.head.mean.bias)[0]
 
 
@@ -76,5 +76,6 @@ def test_without_q_the_learner_imitates_and_nothing_else():
     model = small_model(cls=GACWithoutQ)
     learner = TanhGaussian(th.zeros(2, 1), th.full((2, 1), math.log(0.5)))
     guider = TanhGaussian(th.tensor([[0.2], [0.4]]), learner.log_std)
-    loss = model._learner_loss(learner_inputs({}), ActionDistributions(guider, learner, learner), th.randn(2, 1))
+    now = ActionDistributions(guider, learner, learner)
+    loss = model.learner_objective(batch_of({}), now, th.randn(2, 1), th.tensor(1.0), th.tensor(1.0))
     assert loss.item() == pytest.approx(0.5 * (0.4**2 + 0.8**2) / 2)

@@ -137,7 +137,7 @@ def _with_other_start(batch):
 
 
 def critic_loss_of(model, critic, batch):
-    return model._critic_descent("learner_critic", batch, batch.rewards).metrics["learner_critic_loss"].item()
+    return model.critic_loss("learner_critic", batch, batch.rewards).value.item()
 
 
 @pytest.mark.parametrize("cls", ALGORITHMS)

@@ -18,7 +18,7 @@ def test_moves_up_above_the_target_and_down_below(kl, direction):
     before = dual.value.item()
     loss = dual.update(th.full((8,), kl) - 0.005)["kl_coef_loss"]
     assert direction * (dual.value.item() - before) > 0
-    assert dual.on_bound().item() == 0
+    assert dual.at_bound().item() == 0
     assert loss.item() == pytest.approx(-0.5 * (kl - 0.005), rel=1e-5)
 
 
@@ -28,7 +28,7 @@ def test_stops_at_its_bounds_and_says_so(violation, bound):
     for _ in range(100):
         dual.update(th.tensor([violation]))
     assert dual.value.item() == pytest.approx(bound)
-    assert dual.on_bound().item() == 1
+    assert dual.at_bound().item() == 1
 
 
 def test_leaves_a_bound_when_the_constraint_turns():
@@ -38,7 +38,7 @@ def test_leaves_a_bound_when_the_constraint_turns():
     for _ in range(400):
         dual.update(th.tensor([-1.0]))
     assert dual.value.item() == pytest.approx(0.4)
-    assert dual.on_bound().item() == 1
+    assert dual.at_bound().item() == 1
 
 
 @pytest.mark.parametrize(("spec", "value"), [(0.3, 0.3), ("0.3", 0.3), (0, 0.0), (1, 1.0)])
@@ -46,7 +46,7 @@ def test_a_number_stays_fixed(spec, value):
     coefficient = _kl_coef(spec)
     assert isinstance(coefficient, FixedCoefficient)
     assert coefficient.update(th.ones(3)) == {}
-    assert coefficient.on_bound().item() == 0
+    assert coefficient.at_bound().item() == 0
     assert coefficient.value.item() == pytest.approx(value)
 
 
@@ -62,7 +62,7 @@ def test_auto_starts_inside_its_bounds(bounds, start):
     """At the bound that is nearest where its usual start lies outside, and the bounds stay what they are."""
     dual = _kl_coef("auto", bounds)
     assert dual.value.item() == pytest.approx(start)
-    assert dual.on_bound().item() == (start in bounds)
+    assert dual.at_bound().item() == (start in bounds)
     assert dual.bounds == bounds
     for far_away, bound in zip((-20.0, 20.0), bounds, strict=True):
         dual.log_value.data.fill_(far_away)

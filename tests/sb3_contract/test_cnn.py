@@ -62,7 +62,7 @@ def test_targets_of_features_extractors():
     policy = model.policy
     roles = ("learner", "guider", "guider_critic", "learner_critic")
     assert len({id(getattr(policy, role).features_extractor) for role in roles}) == 4
-    pairs = list(policy.critic_pairs.values())
+    pairs = list(policy.pairs.values())
     assert (model.critic, model.critic_target) == pairs[1]
     for critic, target in pairs:
         _assert_equal(critic.parameters(), target.parameters())

@@ -37,7 +37,7 @@ def test_net_arch(net_arch, policy_sizes, critic_sizes):
     assert model._n_updates > 0
     for network in (model.policy.learner, model.policy.guider):
         assert _hidden_sizes(network) == policy_sizes
-    for critic, target in model.policy.critic_pairs.values():
+    for critic, target in model.policy.pairs.values():
         assert _hidden_sizes(critic) == _hidden_sizes(target) == critic_sizes
 
 
@@ -70,10 +70,8 @@ def test_optimizer(tmp_path, optimizer_class, optimizer_kwargs):
 
 def test_every_parameter_but_the_targets_has_one_optimizer():
     policy = make_gac().policy
-    optimized = [parameter for flat in policy.flat_parameters.values() for parameter in flat.parameters]
-    flats = [flat.flat for flat in policy.flat_parameters.values()]
-    assert [opt.param_groups[0]["params"] for opt in optimizers_of(policy)] == [[flat] for flat in flats]
-    targets = {id(parameter) for _, target in policy.critic_pairs.values() for parameter in target.parameters()}
+    optimized = [parameter for optimizer in optimizers_of(policy) for parameter in optimizer.param_groups[0]["params"]]
+    targets = {id(parameter) for _, target in policy.pairs.values() for parameter in target.parameters()}
     assert len(optimized) == len({id(parameter) for parameter in optimized})
     assert {id(parameter) for parameter in policy.parameters()} - targets == {id(parameter) for parameter in optimized}
 

@@ -55,7 +55,7 @@ def test_entropy_coefficient_is_learned_or_fixed(ent_coef):
 def test_number_of_critics(n_critics):
     model = make_gac(policy_kwargs={"n_critics": n_critics}).learn(30)
     obs, _ = model.policy.obs_to_tensor(model.get_env().reset())
-    for critic, target in model.policy.critic_pairs.values():
+    for critic, target in model.policy.pairs.values():
         assert critic(obs, th.zeros(1, 1)).shape == target(obs, th.zeros(1, 1)).shape == (n_critics, 1)
 
 
