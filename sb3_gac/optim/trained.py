@@ -65,6 +65,7 @@ class TrainedParameters:
             for parameter in self.everything:
                 if not parameter.requires_grad:
                     self.optimizer.state.pop(parameter, None)
+                    parameter.grad = None  # or torch's own step would take it
             self.adam = self._gathered() if _is_plain_adam(self.optimizer) else None
         if self.adam is not None:
             self.adam.learning_rate.fill_(group["lr"])
