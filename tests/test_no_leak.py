@@ -168,7 +168,7 @@ def check_predict(model, tmp_path):
 def check_gradient(model, tmp_path):
     """Of all parameters of the action's distribution: the privileged entries are not in its graph, nor are other networks."""
     obs = {key: value.float().requires_grad_() for key, value in model.policy.obs_to_tensor(_sequence(model)[0])[0].items()}
-    inputs = obs if model.policy.cell is None else {key: value[None] for key, value in obs.items()}
+    inputs = obs if model.policy.deployed.memory is None else {key: value[None] for key, value in obs.items()}
     model.policy.set_training_mode(False)
     total = sum(value.sum() for value in model.policy.deployed.distribution(inputs))
     sources = [*obs.values(), *_parameters_of_others(model)]
@@ -212,7 +212,7 @@ def check_files(model, tmp_path):
     contents, scripted = exported()
     _assert_equal_to_the_bit(_with_all_else_changed(model, exported)[0], contents)
     reads = [key for key in model.observation_space.spaces if key not in _privileged(model)]
-    memory = [] if model.policy.cell is None else ["state"]
+    memory = [] if model.policy.deployed.memory is None else ["state"]
     assert [value.name for value in onnx.load(path).graph.input] == [*reads, *memory]
     assert len(list(scripted.graph.inputs())) == 1 + len(reads) + len(memory), "the module itself, and these"
     for key in _privileged(model):

@@ -12,7 +12,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space
 from stable_baselines3.common.vec_env import VecTransposeImage
 
 from sb3_gac.checks.values import held_by, index_bounds, is_finite
@@ -116,15 +116,28 @@ def encode(values: th.Tensor, space: spaces.Space, normalize_images: bool) -> th
     :param normalize_images: divide images by 255
     :return: float32: Box and MultiBinary in their own shape, (B, 1) if that is (); one-hot, shape (B, F), for the others
     """
-    if isinstance(space, spaces.Discrete):
-        return _one_hot(values.reshape(-1), space.n, space.start)
-    if isinstance(space, spaces.MultiDiscrete):
-        columns = values.flatten(1).unbind(1)
-        choices = zip(columns, space.nvec.ravel(), space.start.ravel(), strict=True)
-        return th.cat([_one_hot(*column) for column in choices], dim=-1)
+    choices = _choices(space)
+    if choices:
+        columns = [values.reshape(-1)] if isinstance(space, spaces.Discrete) else values.flatten(1).unbind(1)
+        return th.cat([_one_hot(column, n, start) for column, (n, start) in zip(columns, choices, strict=True)], dim=-1)
     if space.shape == ():
         return values.float().unsqueeze(-1)
-    return preprocess_obs(values, space, normalize_images=normalize_images)  # type: ignore[return-value]
+    return values.float() / 255.0 if normalize_images and _is_image(space) else values.float()
+
+
+@th.compiler.assume_constant_result
+def _choices(space: spaces.Space) -> list[tuple[int, int]]:
+    """Number of choices and the first one, of each of its numbers; a compiled program takes them as they are."""
+    if isinstance(space, spaces.Discrete):
+        return [(int(space.n), int(space.start))]
+    if isinstance(space, spaces.MultiDiscrete):
+        return list(zip(space.nvec.ravel().tolist(), space.start.ravel().tolist(), strict=True))
+    return []
+
+
+@th.compiler.assume_constant_result
+def _is_image(space: spaces.Space) -> bool:
+    return is_image_space(space)
 
 
 def leading_dimensions(values: th.Tensor, space: spaces.Space) -> int:
@@ -138,9 +151,9 @@ def leading_dimensions(values: th.Tensor, space: spaces.Space) -> int:
     return values.dim() - len(space.shape)  # type: ignore[arg-type]
 
 
-def _one_hot(values: th.Tensor, n: Any, start: Any) -> th.Tensor:
+def _one_hot(values: th.Tensor, n: int, start: int) -> th.Tensor:
     """Shape (B, n); zeros for what is none of the choices, such as the padding of a sequence."""
-    return (values.long().unsqueeze(-1) == th.arange(int(start), int(start) + int(n), device=values.device)).float()
+    return (values.long().unsqueeze(-1) == th.arange(start, start + n, device=values.device)).float()
 
 
 def computable(array: np.ndarray) -> np.ndarray:
