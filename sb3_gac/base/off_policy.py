@@ -373,7 +373,7 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         Which policy acts in each environment, see ``behaviour``; to be overridden by algorithms with a rule of their own.
 
         :param episode_start: true where an episode starts, shape (n_envs,)
-        :return: role of the policy, or name of a frozen one, of each environment; one that has acted stays to the episode's end
+        :return: role of the policy, or name of a frozen one, of each environment; who has acted stays to the episode's end
         """
         return self.chooses_behaviour.choose(self.acting, episode_start, self._current_progress_remaining)
 

@@ -1,6 +1,5 @@
 """Who collects the data: also a policy that nothing trains."""
 
-import numpy as np
 import pytest
 import torch as th
 
@@ -50,5 +49,5 @@ def test_a_frozen_teacher_names_discrete_actions():
 
 def test_a_name_of_nobody_is_refused():
     env = TwoViewBandit()
-    with pytest.raises(ValueError, match="behaviour: a policy must be one of .*'teacher'.*, got 'guider'"):
+    with pytest.raises(ValueError, match=r"behaviour: a policy must be one of .*'teacher'.*, got 'guider'"):
         small_model(env, cls=TGRL, teacher=_teacher(env), behaviour="guider")
