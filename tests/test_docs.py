@@ -33,12 +33,13 @@ def _shorter(block):
 
 @pytest.fixture
 def beside_the_file(tmp_path, monkeypatch):
-    """Where the page's own module and suite are."""
+    """Where the page's own modules and suite are."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(sys.modules, "imitation", raising=False)
     monkeypatch.syspath_prepend(tmp_path)
-    (module,) = _named()["imitation.py"]
-    (tmp_path / "imitation.py").write_text(module)
+    for name in ("imitation", "softer"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        (module,) = _named()[f"{name}.py"]
+        (tmp_path / f"{name}.py").write_text(module)
     (tmp_path / "imitation.yml").write_text(YAML["imitation.yml"])
     return tmp_path
 
@@ -64,7 +65,7 @@ def test_what_a_user_types_runs(beside_the_file, monkeypatch):
     for number, block in enumerate(blocks):
         exec(compile(_shorter(block), f"extending.md, block {number}", "exec"), names)
     assert names["action"].shape == (1,)
-    assert names["again"].num_timesteps > 0
+    assert names["softer"].logger.name_to_value["train/weight"] == pytest.approx(0.5, abs=0.05)
 
 
 def test_what_is_shown_of_tgrl_is_in_its_file():
