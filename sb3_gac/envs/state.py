@@ -95,7 +95,8 @@ def _layer_state(layer: gym.Env) -> dict[str, Any]:
     elif _is_mujoco(layer):
         state = {_MUJOCO: _mujoco_state(layer)}
     elif _name(layer) in CHANGING:
-        there = [attribute for attribute in CHANGING[_name(layer)] if hasattr(layer, attribute)]  # some from the first reset on
+        # Some have theirs from the first reset on
+        there = [attribute for attribute in CHANGING[_name(layer)] if hasattr(layer, attribute)]
         state = {attribute: deepcopy(getattr(layer, attribute)) for attribute in there}
     else:
         raise NotRestorableError(
