@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, OnnxPolicy, export_learner
+from sb3_gac import GAC, TGRL, AsymmetricSAC, OnnxPolicy, export_learner
 from sb3_gac.envs import History
 from tests.helpers import Sampled, small_model
 
@@ -26,6 +26,7 @@ SEVERAL = spaces.Dict(partial=VECTOR, proprio=VECTOR, privileged=VECTOR, forces=
 CHOICE = spaces.Discrete(4)
 CNN = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}}
 SHARED = {"net_arch": [8], "share_features_extractor": True}
+STATE = {"guider": ["privileged"], "critic": ["privileged"]}
 READS_TWO = {"role_keys": {"learner": ["partial", "proprio"]}}
 READS_ALL = {"role_keys": {"learner": ["partial", "privileged"]}}
 
@@ -55,6 +56,9 @@ KINDS = {
     "lstm, discrete": lambda: _recurrent("Lstm", Sampled(VECTORS, CHOICE)),
     "history, two entries": lambda: small_model(History(Sampled(SEVERAL), 3, actions=True), **READS_TWO),
     "asymmetric SAC": lambda: small_model(Sampled(VECTORS), cls=AsymmetricSAC),
+    "gru of the learner alone": lambda: _recurrent("", Sampled(VECTORS), {"rnn_type": {"learner": "gru"}}),
+    "cnn of the learner alone": lambda: small_model(Sampled(IMAGES), policy_kwargs=CNN, role_keys=STATE),
+    "TGRL": lambda: small_model(Sampled(VECTORS), cls=TGRL, teacher=small_model(Sampled(VECTORS), cls=AsymmetricSAC)),
 }
 
 

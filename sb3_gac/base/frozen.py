@@ -1,8 +1,12 @@
 """Policies that are there already: a teacher that is asked and never trained."""
 
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
@@ -28,7 +32,7 @@ class FrozenPolicy(nn.Module):
 
     def __init__(self, model: BaseAlgorithm, name: str = "teacher"):
         super().__init__()
-        if not (isinstance(model, SAC) or isinstance(model.policy, AsymmetricPolicy)):
+        if not (isinstance(model, SAC) or isinstance(getattr(model, "policy", None), AsymmetricPolicy)):
             raise TypeError(f"{name} must be a model of sb3_gac, or SB3's SAC on a Dict space, got {type(model).__name__}.")
         self.policy = model.policy
         if isinstance(self.policy, AsymmetricPolicy) and any(self.policy.rnn_types.values()):
@@ -86,4 +90,15 @@ def _loaded(path: Path, device: th.device, name: str) -> BaseAlgorithm:
     kind = getattr(sb3_gac, (data or {}).get("algorithm", ""), None)
     if kind is None:
         raise ValueError(f"{name}={str(path)!r} is no model that sb3_gac saved: pass the loaded model itself.")
-    return kind.load(path, device=device)
+    with _same_random_numbers():  # those of who asks, which a model's seed would start again
+        return kind.load(path, device=device)
+
+
+@contextmanager
+def _same_random_numbers() -> Iterator[None]:
+    """Random numbers go on as if none had been drawn, or seeds set, in between."""
+    states = random.getstate(), np.random.get_state()
+    with th.random.fork_rng():
+        yield
+    random.setstate(states[0])
+    np.random.set_state(states[1])

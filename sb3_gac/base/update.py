@@ -292,8 +292,16 @@ class NetworkTraining(FaultTolerance):
         self._at_once = self._branches_are_independent and th.get_num_threads() > 1
         settings = (getattr(self, name) for name in self.compiled_settings)
         self._program_key = (self.policy, self.policy.optimizer_options, *settings)
+        history: list[Metrics] = []
         with halved_threads(self._at_once):
-            history = [self._one_update(batch_size) for _ in range(gradient_steps)]
+            for _ in range(gradient_steps):
+                batch = self._sample_batch(batch_size)
+                self._resting = frozenset(name for name, every in self._update_every.items() if self._n_updates % every)
+                whole = self.compile and not self._in_several_programs
+                history.append(self._compiled("update", self.update, batch) if whole else self.update(batch))
+                self._n_updates += 1
+                if self._n_updates % self.target_update_interval == 0:
+                    self.policy.update_targets(self.tau)
         self._record_metrics(history)
 
     def _waits_for_an_episode(self) -> bool:
@@ -308,16 +316,6 @@ class NetworkTraining(FaultTolerance):
             )
         self._waiting = waits
         return waits
-
-    def _one_update(self, batch_size: int) -> Metrics:
-        batch = self._sample_batch(batch_size)
-        self._resting = frozenset(name for name, every in self._update_every.items() if self._n_updates % every)
-        whole = self.compile and not self._at_once
-        metrics = self._compiled("update", self.update, batch) if whole else self.update(batch)
-        self._n_updates += 1
-        if self._n_updates % self.target_update_interval == 0:
-            self.policy.update_targets(self.tau)
-        return metrics
 
     @property
     def _in_several_programs(self) -> bool:

@@ -1,6 +1,5 @@
 """Teacher-Guided RL: imitate a frozen teacher for as long as that pays off in return."""
 
-from collections import deque
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -106,12 +105,9 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
     ):
         self.teacher = teacher
         self.teacher_coef, self.coef_step, self.compare_every, self.window = teacher_coef, coef_step, compare_every, window
+        self.returns: dict[str, list[float]] = {"actor": [], "auxiliary": []}
+        self.next_comparison = compare_every
         super().__init__(policy, env, *sb3, **shared)
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self.returns: dict[str, deque[float]] = {role: deque(maxlen=self.window) for role in self.policy.roles.policies}
-        self.next_comparison = self.compare_every
 
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The entropy temperature, and the weight of the teacher."""
@@ -177,7 +173,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
     def on_episode_end(self, env: int, episode_return: float, role: str | None) -> None:
         """See :meth:`AsymmetricOffPolicyAlgorithm.on_episode_end`."""
         if role in self.returns:  # neither the warm-up nor the teacher
-            self.returns[role].append(episode_return)
+            self.returns[role] = [*self.returns[role], episode_return][-self.window :]
 
     def on_step(self) -> None:
         """The teacher's weight takes a step: up where the main actor's latest episodes were the better ones."""

@@ -1,1 +1,1 @@
-"""How networks and coefficients are moved: steps of optimisers, duals and other coefficients, targets, compilation, threads."""
+"""How networks and coefficients are moved: optimisers' steps, coefficients, targets, compilation, threads."""

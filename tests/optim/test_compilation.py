@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_gac import GAC, AsymmetricSAC
+from sb3_gac import GAC, TGRL, AsymmetricSAC
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
+
+TEACHER = small_model(cls=AsymmetricSAC, role_keys={"actor": ["partial", "privileged"]})
 
 
 def _filled(cls, **arguments):
+    if cls is TGRL:
+        arguments["teacher"] = TEACHER
     return small_model(cls=cls, learning_starts=1000, **arguments).learn(64)
 
 
@@ -26,7 +30,7 @@ def _assert_equal(model, other, **tolerance):
         th.testing.assert_close(p, q, **tolerance, msg=lambda text, name=name: f"{name}: {text}")
 
 
-@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL])
 def test_compiled_training_is_plain_training(cls, tmp_path):
     """Through other batch sizes and settings, new weights, a copy of the policy and a save: nothing stale is used."""
     plain, compiled = _filled(cls), _filled(cls, compile=True)
@@ -46,7 +50,7 @@ def test_compiled_training_is_plain_training(cls, tmp_path):
     _train((plain, compiled))
     _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
     compiled.save(tmp_path / "model")
-    loaded = cls.load(tmp_path / "model", env=TwoViewBandit())
+    loaded = cls.load(tmp_path / "model", env=TwoViewBandit(), **({"teacher": TEACHER} if cls is TGRL else {}))
     loaded.set_logger(compiled.logger)
     loaded.replay_buffer = compiled.replay_buffer
     assert loaded.compile

@@ -1,0 +1,159 @@
+"""
+Gradient steps per second of this checkout beside those of another one, in alternation::
+
+    git worktree add ../before v1.0
+    python -m benchmarks.versus ../before --out benchmarks/results/versus.json
+
+Each checkout's models are in a process of their own, and only one of them works at a time. The ratio of a pair of measurements
+that follow each other stands whatever else the machine does; its median and quartiles over all pairs are what is written.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.run import provenance
+
+HERE = Path(__file__).resolve().parent.parent
+SIZES = {"128 units, batch 128": (128, 128), "256 units, batch 256": (256, 256), "512 units, batch 256": (512, 256)}
+#: What each process runs: it reads a number of gradient steps a line, and answers with the seconds that each took
+PROGRAM = """
+import sys, time, warnings
+warnings.simplefilter("ignore")
+import torch as th
+algorithm, width, batch, threads, compiled, clock = sys.argv[1], *map(int, sys.argv[2:6]), getattr(time, sys.argv[6])
+th.set_num_threads(threads)
+import gymnasium
+import sb3_gac
+model = getattr(sb3_gac, algorithm)("MultiInputPolicy", gymnasium.make("sb3_gac/HalfCheetah-v5", noise_std=0.1), seed=0,
+    buffer_size=2000, learning_starts=1000, policy_kwargs={"net_arch": [width, width]}, compile=bool(compiled), device="cpu")
+model.learn(500)
+model.train(3, batch)
+print("ready", sb3_gac.__file__, flush=True)
+for line in sys.stdin:
+    start = clock()
+    model.train(int(line), batch)
+    print((clock() - start) / int(line), flush=True)
+"""
+
+
+class Contender:
+    """
+    A model of one checkout, in a process.
+
+    :param checkout: directory
+    :param arguments: of ``PROGRAM``
+    """
+
+    def __init__(self, checkout: Path, arguments: Sequence[Any]):
+        self._what = f"{checkout.name}, {arguments}"
+        command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
+        env = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(arguments[3])}
+        self._process = subprocess.Popen(
+            command, cwd=checkout, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        said = self._read().split()
+        if Path(said[1]).resolve().parent.parent != checkout.resolve():
+            raise RuntimeError(f"{checkout}: its process imports {said[1]}.")
+
+    def _read(self) -> str:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"{self._what}: the process ended, see above.")
+        return line
+
+    def seconds(self, steps: int) -> float:
+        """
+        :param steps: gradient steps
+        :return: of each
+        """
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{steps}\n")
+        self._process.stdin.flush()
+        return float(self._read())
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def compare(other: Path, arguments: Sequence[Any], steps: int, pairs: int) -> dict[str, float]:
+    """
+    :param other: checkout
+    :param arguments: of ``PROGRAM``
+    :param steps: gradient steps of each measurement
+    :param pairs: of measurements
+    :return: milliseconds of a step here and there, medians; quartiles of how many times as fast this checkout is
+    """
+    contenders = [Contender(checkout, arguments) for checkout in (HERE, other)]
+    times = np.array([[contender.seconds(steps) for contender in contenders] for _ in range(pairs + 1)])[1:]
+    for contender in contenders:
+        contender.close()
+    low, middle, high = np.percentile(times[:, 1] / times[:, 0], [25, 50, 75])
+    here, there = 1e3 * np.median(times, axis=0)
+    numbers = {"here_ms": here, "there_ms": there, "ratio_q1": low, "ratio": middle, "ratio_q3": high}
+    return {name: round(float(value), 3) for name, value in numbers.items()}
+
+
+def commit(checkout: Path) -> str:
+    """
+    :param checkout: directory
+    :return: its commit
+    """
+    return subprocess.run(
+        ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    Command line.
+
+    :param arguments: by default the process's
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkout", type=Path, help="directory of the other one")
+    parser.add_argument("--algorithms", nargs="+", default=["GAC", "AsymmetricSAC"])
+    parser.add_argument("--sizes", nargs="+", choices=list(SIZES), default=list(SIZES))
+    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--compiled", nargs="+", type=int, choices=[0, 1], default=[0, 1])
+    parser.add_argument("--pairs", type=int, default=15, help="of measurements")
+    parser.add_argument("--seconds", type=float, default=0.5, help="of each measurement")
+    parser.add_argument("--clock", choices=["perf_counter", "process_time"], default="perf_counter")
+    parser.add_argument("--out", type=Path, help="JSON file")
+    options = parser.parse_args(arguments)
+    rows = []
+    for algorithm in options.algorithms:
+        for size in options.sizes:
+            for threads in options.threads:
+                for compiled in options.compiled:
+                    width, batch = SIZES[size]
+                    steps = max(3, round(options.seconds / (width * width * batch * (1 if threads > 1 else 2) / 3e9)))
+                    program = (algorithm, width, batch, threads, compiled, options.clock)
+                    numbers = compare(options.checkout.resolve(), program, steps, options.pairs)
+                    rows.append(
+                        {"algorithm": algorithm, "size": size, "threads": threads, "compiled": bool(compiled), **numbers}
+                    )
+                    print(json.dumps(rows[-1]), flush=True)
+    if options.out is not None:
+        record = {
+            "command": " ".join(["python -m benchmarks.versus", options.checkout.name, *sys.argv[2:]]),
+            "there": commit(options.checkout),
+            **provenance(),
+            "rows": rows,
+        }
+        options.out.write_text(json.dumps(record, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
