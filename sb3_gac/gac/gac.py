@@ -155,3 +155,6 @@ class GAC(GuidedUpdate):
         scaled_action, after = self.policy.behaviour_action(observation, state, episode_start, deterministic)
         action = self._in_environments_range(scaled_action)
         return (action if vectorized else action.squeeze(axis=0)), after
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "target_kl_tensor"]

@@ -94,9 +94,10 @@ class TrainedParameters:
         :param state: an optimiser's ``state_dict``, of this version or of those that laid all parameters out as one
         :return: with an entry for each parameter
         """
-        (group,) = state["param_groups"]
-        if len(group["params"]) == len(self.everything):
+        groups = state.get("param_groups", ())
+        if len(groups) != 1 or len(groups[0]["params"]) == len(self.everything):
             return state
+        (group,) = groups
         trained = group.get("trained", [True] * len(self.everything))
         indices = [index for index, was_trained in enumerate(trained) if was_trained]
         shapes = [self.everything[index].shape for index in indices]

@@ -5,9 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 
 from sb3_gac import GAC, TGRL, AsymmetricSAC
-from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
+from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
 
 TEACHER = small_model(cls=AsymmetricSAC, role_keys={"actor": ["partial", "privileged"]})
 
@@ -56,6 +57,51 @@ def test_compiled_training_is_plain_training(cls, tmp_path):
     assert loaded.compile
     _train((plain, loaded), batch_size=8)
     _assert_equal(plain, loaded, rtol=1e-4, atol=1e-6)
+
+
+IMAGES = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=spaces.Box(-1, 1, (2,), np.float32))
+KINDS = {
+    "discrete": lambda **arguments: _filled(GAC, env=TwoViewChoice(), **arguments),
+    "images, AdamW": lambda **arguments: _filled(
+        AsymmetricSAC,
+        env=Sampled(IMAGES),
+        policy_kwargs={
+            "net_arch": [8],
+            "features_extractor_kwargs": {"cnn_output_dim": 8},
+            "optimizer_class": th.optim.AdamW,
+            "optimizer_kwargs": {"weight_decay": 0.1},
+        },
+        role_keys={"critic": ["privileged"]},
+        **arguments,
+    ),
+    "guider's std, pulled": lambda **arguments: _filled(GAC, shared_std="guider", learner_kl_scale=1.0, **arguments),
+}
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_compiled_to_what_it_is(kind, threads):
+    """On one thread as one program; on two, branches are programs of their own, and run at once."""
+    if kind == "images, AdamW" and threads == 2:
+        pytest.skip("SAC has one branch")
+    before = th.get_num_threads()
+    th.set_num_threads(threads)
+    try:
+        plain, compiled = KINDS[kind](), KINDS[kind](compile=True)
+        _train((plain, compiled))
+        names = {key[0] for key in compiled.programs}
+        branches = threads > 1 and isinstance(compiled, GAC)
+        of_branches = {("guider", "learner"), ("guider_critic", "guider"), ("learner_critic", "learner")}
+        assert names == (of_branches if branches else {"update"})
+    finally:
+        th.set_num_threads(before)
+    _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
+
+
+def test_an_optimiser_that_can_not_be_compiled_is_named():
+    for options in ({"optimizer_class": th.optim.SGD}, {"optimizer_kwargs": {"amsgrad": True}}):
+        with pytest.raises(ValueError, match=r"compile=True can do torch's Adam and AdamW.*the optimiser of learner is"):
+            small_model(compile=True, policy_kwargs={"net_arch": [8], **options})
 
 
 @pytest.mark.parametrize(
