@@ -459,13 +459,13 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         """
         if not given:
             return
-        before = {name: (getattr(self, name), coefficient) for name, coefficient in self.coefficients.items()}
+        before = {name: (getattr(self, name, None), coefficient) for name, coefficient in self.coefficients.items()}
         vars(self).update({KEPT_AS.get(name, name): value for name, value in given.items()})
         make_arguments_plain(self)
         self._check_arguments()
         self.coefficients = self.make_coefficients()
         for name, (spec, coefficient) in before.items():
-            spec_now = getattr(self, name)
+            spec_now = getattr(self, name, None)
             if not any(other.startswith(name) for other in given):
                 self.coefficients[name] = coefficient
             elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, DualVariable)):
