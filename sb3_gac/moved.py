@@ -26,8 +26,6 @@ MOVED = {
         "common.env_guard": "checks.environments",
         "common.episodes": "replay.episodes",
         "common.faults": "base.faults",
-        "common.flat": "optim.flat",
-        "common.graphs": "optim.graphs",
         "common.guard": "base.strict_predict",
         "common.heads": "networks.heads",
         "common.losses": "math.losses",

@@ -53,3 +53,10 @@ def test_suites_of_environments_are_found_where_they_were(suite, recwarn):
 def test_other_names_are_nowhere():
     with pytest.raises(ModuleNotFoundError, match=r"sb3_gac\.common\.nothing"):
         importlib.import_module("sb3_gac.common.nothing")
+
+
+def test_the_runner_of_exported_files_is_found_by_its_former_name():
+    learner = importlib.import_module("sb3_gac.learner")
+    for place in (importlib.import_module("sb3_gac"), learner):
+        with pytest.warns(DeprecationWarning, match="Learner is .*OnnxPolicy now"):
+            assert place.Learner is learner.OnnxPolicy

@@ -15,7 +15,7 @@ from sb3_gac import GAC
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-SHORTER = {"100_000": "600", "1_000_000": "300", "5_000": "150", "20_000": "100"}
+SHORTER = {"100_000": "600", "1_000_000": "300", "5_000": "150", "20_000": "100", "200_000": "120"}
 SMALL = {"learning_starts": 100, "batch_size": 16, "buffer_size": 1_000, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
 
 

@@ -9,7 +9,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_gac.base.roles import Roles
 from sb3_gac.checks.values import check_choice
 
-#: A policy's role, or role -> share of episodes, a number or a schedule; the default policy has the rest
+#: A policy's name, or name -> share of episodes, a number or a schedule; the default policy has the rest
 BehaviourSpec: TypeAlias = str | Mapping[str, float | Schedule] | None
 
 
@@ -20,15 +20,16 @@ class Behaviour:
     :param roles: of the algorithm
     :param behaviour: see ``BehaviourSpec``; ``None`` for the policy that the algorithm collects with
     :param per: "episode": drawn anew at each episode's start; "environment": the share is one of environments
-    :raises ValueError: if a role is no policy, or shares are not from 0 to 1
+    :param frozen: names of frozen policies, which may act as well
+    :raises ValueError: if a name is no policy's, or shares are not from 0 to 1
     """
 
-    def __init__(self, roles: Roles, behaviour: BehaviourSpec, per: str = "episode"):
+    def __init__(self, roles: Roles, behaviour: BehaviourSpec, per: str = "episode", frozen: Sequence[str] = ()):
         self.default = behaviour if isinstance(behaviour, str) else roles.behaviour
         self.shares: dict[str, Any] = dict(behaviour) if isinstance(behaviour, Mapping) else {}
         self.per = per
         for role in (self.default, *self.shares):
-            check_choice("behaviour: a policy", role, roles.policies)
+            check_choice("behaviour: a policy", role, (*roles.policies, *frozen))
         self._shares_now(1.0)
 
     def _shares_now(self, progress_remaining: float) -> dict[str, float]:

@@ -82,8 +82,8 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
     :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
     :param policy_delay: gradient steps to each step of a policy; critics take all
     :param update_every: network -> gradient steps to each step of its own, "critic" standing for all critics
-    :param behaviour: which policy collects the data, by name, or network -> share of episodes, a number or a schedule; by
-        default that of the algorithm
+    :param behaviour: which policy collects the data, by name, or name -> share of episodes, a number or a schedule; by
+        default that of the algorithm; a frozen teacher has the name of its argument
     :param behaviour_per: "episode", or "environment" for shares of the environments
     :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
@@ -188,7 +188,7 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         if self.compile:
             self._check_can_compile(side_effects)
         self._update_every = resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
-        self.chooses_behaviour = Behaviour(self.policy_class.roles, self.behaviour, self.behaviour_per)
+        self.chooses_behaviour = self._make_behaviour()
         self.coefficients = self.make_coefficients()
         self._keep_coefficients()
         self.programs = {}
@@ -236,7 +236,7 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         check_goals(self.replay_buffer_class, self.observation_space, self.env)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
         resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
-        Behaviour(self.policy_class.roles, self.behaviour, self.behaviour_per)
+        self._make_behaviour()
         if self.is_recurrent:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
@@ -309,8 +309,9 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
 
     @property
     def log_ent_coef(self) -> th.Tensor | None:
-        """Logarithm of a learned entropy temperature; ``None`` if it is fixed."""
-        return self.ent_coef_dual.log_value if isinstance(self.ent_coef_dual, DualVariable) else None
+        """Logarithm of a learned entropy temperature; ``None`` if it is fixed, or there is none."""
+        temperature = self.coefficients.get("ent_coef")
+        return temperature.log_value if isinstance(temperature, DualVariable) else None
 
     @property
     def ent_coef_tensor(self) -> th.Tensor:
@@ -319,8 +320,9 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
 
     @property
     def ent_coef_optimizer(self) -> th.optim.Optimizer | None:
-        """Optimiser of a learned entropy temperature."""
-        return self.ent_coef_dual.optimizer
+        """Optimiser of a learned entropy temperature; ``None`` if it is fixed, or there is none."""
+        temperature = self.coefficients.get("ent_coef")
+        return None if temperature is None else temperature.optimizer
 
     def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
         """Optimisers that follow ``learning_rate``."""
@@ -350,21 +352,28 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         if warms_up and not self.is_recurrent:
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, dict)
+        trained = [self.policy.roles.behaviour if role in self.frozen else role for role in self.acting]
         scaled_action, self._behaviour_state = self.policy.behaviour_action(
-            self._last_obs, self._behaviour_state, episode_starts, acting=self.acting
+            self._last_obs, self._behaviour_state, episode_starts, acting=trained
         )
+        for name in self.frozen.keys() & set(self.acting):
+            rows = np.array([role == name for role in self.acting])
+            scaled_action[rows] = self.policy.frozen_action(self.frozen[name], self._last_obs)[rows]
         if warms_up:  # the memory was brought up
             return super()._sample_action(learning_starts, action_noise, n_envs)
         if action_noise is not None:
             scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
         return self._in_environments_range(scaled_action), scaled_action
 
+    def _make_behaviour(self) -> Behaviour:
+        return Behaviour(self.policy_class.roles, self.behaviour, self.behaviour_per, self.frozen_arguments)
+
     def choose_acting(self, episode_start: np.ndarray) -> list[str]:
         """
         Which policy acts in each environment, see ``behaviour``; to be overridden by algorithms with a rule of their own.
 
         :param episode_start: true where an episode starts, shape (n_envs,)
-        :return: role of the policy, of each environment; one that has acted stays to the episode's end
+        :return: role of the policy, or name of a frozen one, of each environment; who has acted stays to the episode's end
         """
         return self.chooses_behaviour.choose(self.acting, episode_start, self._current_progress_remaining)
 
@@ -450,13 +459,13 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         """
         if not given:
             return
-        before = {name: (getattr(self, name), coefficient) for name, coefficient in self.coefficients.items()}
+        before = {name: (getattr(self, name, None), coefficient) for name, coefficient in self.coefficients.items()}
         vars(self).update({KEPT_AS.get(name, name): value for name, value in given.items()})
         make_arguments_plain(self)
         self._check_arguments()
         self.coefficients = self.make_coefficients()
         for name, (spec, coefficient) in before.items():
-            spec_now = getattr(self, name)
+            spec_now = getattr(self, name, None)
             if not any(other.startswith(name) for other in given):
                 self.coefficients[name] = coefficient
             elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, DualVariable)):

@@ -376,6 +376,16 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
             actions[rows] = self._chosen(policies[role], deterministic)[rows]
         return actions, None if all(remembered is None for remembered in after) else after
 
+    @th.no_grad()
+    def frozen_action(self, policy: nn.Module, observation: dict[str, np.ndarray]) -> np.ndarray:
+        r"""
+        :param policy: that is no network of this one's, see :class:`sb3_gac.base.frozen.FrozenPolicy`
+        :param observation: full observation, B of each entry
+        :return: a sample of its actions, in [-1, 1] or of a number, shape (B, \*action shape)
+        """
+        obs, _ = self.reader.read(observation, self.device)
+        return self._chosen(policy(obs), deterministic=False)
+
     def _chosen(self, actions: Distribution, deterministic: bool) -> np.ndarray:
         r"""
         :param actions: shapes (B, A)

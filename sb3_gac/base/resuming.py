@@ -174,6 +174,8 @@ class ResumableAlgorithm(NetworkTraining):
                 value = getattr(self, KEPT_AS.get(name, name))
                 if isinstance(value, TrainFreq):
                     value = (value.frequency, value.unit.value)
+                if name == "policy":  # by its name, if it has one: the class may be the user's own
+                    value = next((alias for alias, kind in self.policy_aliases.items() if kind is value), value)
                 arguments[name] = {"value": encode(value, arrays)}
             except (UntrustedNameError, AttributeError, TypeError) as error:
                 arguments[name] = {"cannot": str(error)}
@@ -252,7 +254,8 @@ class ResumableAlgorithm(NetworkTraining):
         """Of those that were given: that they are what the checkpoint's networks and buffer were made with."""
         for name in FIXED:
             if name in given and name in before:
-                check_unchanged(name, getattr(self, KEPT_AS.get(name, name)), before[name], "resume()")
+                then = self.policy_aliases.get(before[name], before[name]) if name == "policy" else before[name]
+                check_unchanged(name, getattr(self, KEPT_AS.get(name, name)), then, "resume()")
         if "replay_buffer_kwargs" in given and "replay_buffer_kwargs" in before:
             now, then = ((arguments["replay_buffer_kwargs"] or {}).get("storage_dtype") for arguments in (given, before))
             check_unchanged("replay_buffer_kwargs' storage_dtype", now, then, "resume()")

@@ -172,7 +172,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
 
     def on_episode_end(self, env: int, episode_return: float, role: str | None) -> None:
         """See :meth:`AsymmetricOffPolicyAlgorithm.on_episode_end`."""
-        if role is not None:
+        if role in self.returns:  # neither the warm-up nor the teacher
             self.returns[role] = [*self.returns[role], episode_return][-self.window :]
 
     def on_step(self) -> None:

@@ -95,7 +95,9 @@ def _layer_state(layer: gym.Env) -> dict[str, Any]:
     elif _is_mujoco(layer):
         state = {_MUJOCO: _mujoco_state(layer)}
     elif _name(layer) in CHANGING:
-        state = {attribute: deepcopy(getattr(layer, attribute)) for attribute in CHANGING[_name(layer)]}
+        # Some have theirs from the first reset on
+        there = [attribute for attribute in CHANGING[_name(layer)] if hasattr(layer, attribute)]
+        state = {attribute: deepcopy(getattr(layer, attribute)) for attribute in there}
     else:
         raise NotRestorableError(
             f"it is not known what the state of {_name(layer)} is: give it the methods checkpoint_state() and "
@@ -117,7 +119,7 @@ def _restore_layer(layer: gym.Env, state: dict[str, Any]) -> None:
         if isinstance(layer, gym.wrappers.PassiveEnvChecker):
             vars(layer).update(dict.fromkeys(_CHECKED, True))
         for attribute, value in state.items():
-            now = getattr(layer, attribute)
+            now = getattr(layer, attribute, None)
             setattr(layer, attribute, deque(value, maxlen=now.maxlen) if isinstance(now, deque) else value)
 
 

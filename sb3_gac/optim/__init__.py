@@ -1,1 +1,1 @@
-"""How networks and coefficients are moved: flat parameters, optimisers, duals, compilation, threads."""
+"""How networks and coefficients are moved: optimisers' steps, coefficients, targets, compilation, threads."""

@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 
 from sb3_gac import GAC, AsymmetricSAC, EpisodeReplayBuffer, GACShare, GACWithoutQ
 from sb3_gac.base.overrides import algorithm_of
+from sb3_gac.optim.coefficients import AdditiveCoefficient
 from tests.helpers import Recall, TwoViewBandit, optimizers_of, small_model
 
 ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
@@ -304,3 +305,20 @@ def test_a_policy_that_is_saved_by_itself_has_the_scales_that_were_given(cls, tm
     scales = [[optimizer.param_groups[0]["lr_scale"] for optimizer in optimizers_of(p)] for p in (again.policy, loaded)]
     assert scales[0] == scales[1]
     assert set(scales[1]) == {1.0, 3.0}
+
+
+class _Weighted(AsymmetricSAC):
+    """Has a coefficient that no argument is the start value of."""
+
+    def make_coefficients(self):
+        weight = AdditiveCoefficient(1.0, 0.5, (0.0, 9.0), self.device)
+        return super().make_coefficients() | {"weight": weight}
+
+
+@pytest.mark.parametrize("how", ["load", "resume"])
+def test_a_coefficient_without_an_argument_stays_when_another_is_given(how, tmp_path):
+    model = small_model(cls=_Weighted).learn(20)
+    model.coefficients["weight"].move(1.0)
+    again = _again(how, model, tmp_path, ent_coef=0.25)
+    assert again.coefficients["weight"].value == 1.5
+    assert again.coefficients["ent_coef"].value == 0.25

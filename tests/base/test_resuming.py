@@ -98,6 +98,7 @@ class Succeeds(Recall):
 
 #: Attributes of a model that are not what training has done so far: other objects that do the same, or a process's own
 NOT_PROGRESS = {"env", "policy", "replay_buffer", "_logger", "start_time", "_vec_normalize_env", "action_noise", "_last_use"}
+NOT_PROGRESS |= {"coefficients"}  # whose tensors are compared with the networks'
 OF_RESUMING = {
     "_saved_blocks",
     "_resumed_noise",

@@ -57,13 +57,20 @@ def test_another_environment_goes_on_to_the_bit(name):
     assert other.episode_returns == env.episode_returns
 
 
-def test_a_state_from_before_the_first_step():
-    env, other = MAKERS["Hopper"](), MAKERS["Hopper"]()
+@pytest.mark.parametrize("name", MAKERS)
+def test_an_environment_that_was_never_reset_takes_a_state_from_before_the_first_step(name):
+    env, other = MAKERS[name](), MAKERS[name]()
     env.reset(seed=0)
     state = env_state(env)
     restore_env_state(other, state)
     actions = [env.action_space.sample() for _ in range(5)]
     np.testing.assert_equal(_go_on(other, actions), _go_on(env, actions))
+
+
+def test_a_state_from_before_the_first_reset():
+    env, other = _pendulum(), _pendulum()
+    restore_env_state(other, env_state(env))
+    np.testing.assert_equal(other.reset(seed=0)[0], env.reset(seed=0)[0])
 
 
 class _Unknown(gym.Wrapper):
