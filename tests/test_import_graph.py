@@ -18,7 +18,7 @@ ROOMS = {
     "networks": "networks|math|checks",
     "replay": "replay|checks",
     "checkpoint": "checkpoint|envs",
-    "base": "base|math|checks|optim|networks|replay|checkpoint|envs",
+    "base": "algorithms|base|math|checks|optim|networks|replay|checkpoint|envs",
     "deploy": "deploy|base|checks|networks|envs|learner|version",
 }
 FORBIDDEN = {

@@ -15,6 +15,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_gac.algorithms import ALGORITHMS, import_path
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.entries import encode
 from sb3_gac.math.distributions import TanhGaussian
@@ -84,12 +85,15 @@ def load_frozen_policy(
 
 
 def _loaded(path: Path, device: th.device, name: str) -> BaseAlgorithm:
-    import sb3_gac
-
     data, _, _ = load_from_zip_file(path, device=device, load_data=True)
-    kind = getattr(sb3_gac, (data or {}).get("algorithm", ""), None)
-    if kind is None:
-        raise ValueError(f"{name}={str(path)!r} is no model that sb3_gac saved: pass the loaded model itself.")
+    saved = data or {}
+    paths = [known for known in ALGORITHMS.values() if known.endswith(f":{saved.get('algorithm')}")]
+    try:
+        kind = import_path(saved.get("algorithm_path") or paths[0])
+    except (IndexError, ValueError):
+        raise ValueError(
+            f"{name}={str(path)!r} is no model of a class that can be imported: pass the loaded model itself."
+        ) from None
     with _same_random_numbers():  # those of who asks, which a model's seed would start again
         return kind.load(path, device=device)
 

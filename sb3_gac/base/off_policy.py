@@ -166,6 +166,7 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         make_arguments_plain(self)
         self._check_arguments()
         self.algorithm = algorithm_of(type(self))  # so that a file says whose it is
+        self.algorithm_path = f"{type(self).__module__}:{type(self).__qualname__}"
         if self.replay_buffer_class is None:
             self.replay_buffer_class = EpisodeReplayBuffer if self.is_recurrent else CompactDictReplayBuffer
         self._fit_action_noise()

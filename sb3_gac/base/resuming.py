@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
 from typing_extensions import Self
@@ -172,6 +173,8 @@ class ResumableAlgorithm(NetworkTraining):
         for name in constructor_arguments(type(self)):
             try:
                 value = getattr(self, KEPT_AS.get(name, name))
+                if isinstance(value, BaseAlgorithm):
+                    raise UntrustedNameError("it is a model, and not the path of one")
                 if isinstance(value, TrainFreq):
                     value = (value.frequency, value.unit.value)
                 if name == "policy":  # by its name, if it has one: the class may be the user's own

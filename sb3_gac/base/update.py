@@ -262,7 +262,7 @@ class NetworkTraining(FaultTolerance):
             return outputs.now
         return getattr(self.policy, role).distribution(batch.observations)
 
-    def critic_loss(self, name: str, batch: Batch, target: th.Tensor) -> Loss:
+    def bellman_loss(self, name: str, batch: Batch, target: th.Tensor) -> Loss:
         r"""
         :param name: of the critics
         :param batch: of transitions
@@ -288,7 +288,7 @@ class NetworkTraining(FaultTolerance):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._scheduled_optimizers())
         self.policy.refresh_parameters()
-        self._refresh_schedules()
+        self.refresh_schedules()
         self._at_once = self._branches_are_independent and th.get_num_threads() > 1
         settings = (getattr(self, name) for name in self.compiled_settings)
         self._program_key = (self.policy, self.policy.optimizer_options, *settings)
@@ -359,7 +359,7 @@ class NetworkTraining(FaultTolerance):
             discounts.flatten() if discounts.dim() else discounts,
         )
 
-    def _refresh_schedules(self) -> None:
+    def refresh_schedules(self) -> None:
         """Before a round of gradient steps: put in tensors what schedules say now."""
         for coefficient in self.coefficients.values():
             coefficient.refresh()

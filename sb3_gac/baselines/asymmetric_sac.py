@@ -56,17 +56,17 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         beta = self.ent_coef_dual.value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
         (actor,) = self.outputs(batch, "actor")
-        metrics = self.minimize("critic", self.sac_critic_loss, batch, actor, noise[0], beta)
+        metrics = self.minimize("critic", self.critic_loss, batch, actor, noise[0], beta)
         metrics |= self.minimize("actor", self.actor_loss, batch, actor, noise[1], beta)
         metrics |= self.ent_coef_dual.update(float(self.target_entropy) - metrics["entropy"])
         return metrics | self.coefficient_values()
 
-    def sac_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
+    def critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """The actor's return, with its entropy."""
         with th.no_grad():
             next_q, log_prob = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
             target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta)
-        return self.critic_loss("critic", batch, target)
+        return self.bellman_loss("critic", batch, target)
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """Climb the critics, with entropy."""

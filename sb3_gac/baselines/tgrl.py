@@ -133,7 +133,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
         with th.no_grad():
             next_q, log_prob = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.reward_critic_target), noise)
             target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta)
-        return self.critic_loss("reward_critic", batch, target)
+        return self.bellman_loss("reward_critic", batch, target)
 
     def teacher_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor) -> Loss:
         """Q_I: discounted -KL(actor || teacher) from the next observation on, and no reward."""
@@ -141,7 +141,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
             next_q, _ = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.teacher_critic_target), noise)
             kl = actor.later.kl(self.frozen["teacher"](batch.next_observations))
             target = batch.soft_target(next_q, reward=th.zeros_like(batch.rewards), kl=kl, kl_coef=1.0)
-        return self.critic_loss("teacher_critic", batch, target)
+        return self.bellman_loss("teacher_critic", batch, target)
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor, c: th.Tensor) -> Loss:
         """beta log pi - min Q_R + c (KL - min Q_I)."""

@@ -66,7 +66,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
             next_q, log_prob = later.guider.value_and_log_prob(batch.q_at_next_obs(self.policy.guider_critic_target), noise)
             kl = later.guider.kl_of_means(later.learner, self.kl_reduction)
             target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta, kl=kl, kl_coef=alpha)
-        return self.critic_loss("guider_critic", batch, target)
+        return self.bellman_loss("guider_critic", batch, target)
 
     def guider_loss(
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
@@ -95,7 +95,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
             policy = self.policy.action_distributions(guider.later, learner.later).learner
             next_q, log_prob = policy.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
             target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta * self.learner_entropy)
-        return self.critic_loss("learner_critic", batch, target)
+        return self.bellman_loss("learner_critic", batch, target)
 
     def learner_loss(
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
@@ -136,6 +136,6 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
     def _auto_learner_kl_weight(self) -> float:
         return 0.0 if self.guider == "residual" else 1.0
 
-    def _refresh_schedules(self) -> None:
-        super()._refresh_schedules()
+    def refresh_schedules(self) -> None:
+        super().refresh_schedules()
         self.target_kl_tensor.fill_(self.current_target_kl)

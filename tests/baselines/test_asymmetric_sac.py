@@ -95,7 +95,7 @@ def test_each_loss_moves_its_own_network():
 
     (actor,) = model.outputs(batch, "actor")
     noise, beta = th.randn(32, 1), th.tensor(0.1)
-    assert changed(lambda: model.minimize("critic", model.sac_critic_loss, batch, actor, noise, beta)) == {"critic"}
+    assert changed(lambda: model.minimize("critic", model.critic_loss, batch, actor, noise, beta)) == {"critic"}
     assert changed(lambda: model.minimize("actor", model.actor_loss, batch, actor, noise, beta)) == {"actor"}
 
 

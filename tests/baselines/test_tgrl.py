@@ -77,9 +77,19 @@ def test_what_can_not_teach_is_refused(teacher, error, message):
         make_student(teacher=teacher())
 
 
+class OfAnotherPackage(AsymmetricSAC):
+    """Somebody's own."""
+
+
+def test_a_path_may_be_of_somebodys_own_class(tmp_path):
+    make_teacher(cls=OfAnotherPackage, **FULL).save(tmp_path / "teacher.zip")
+    model = make_student(teacher=str(tmp_path / "teacher.zip"))
+    assert model.frozen["teacher"].policy.role_keys["actor"] == ("partial", "privileged")
+
+
 def test_a_file_that_is_no_model_of_the_package_is_named(tmp_path):
     SAC("MultiInputPolicy", TwoViewBandit(), device="cpu", buffer_size=10).save(tmp_path / "sac.zip")
-    with pytest.raises(ValueError, match=r"sac.zip' is no model that sb3_gac saved: pass the loaded model itself"):
+    with pytest.raises(ValueError, match=r"sac.zip' is no model of a class that can be imported: pass the loaded"):
         make_student(teacher=str(tmp_path / "sac.zip"))
 
 
@@ -176,7 +186,7 @@ def test_resumed_it_is_the_same_to_the_bit(as_path, tmp_path):
     through, stopped = make().learn(107), make().learn(63)
     stopped.save_checkpoint(tmp_path / "checkpoints")
     if not as_path:
-        with pytest.raises(ValueError, match=r"No checkpoint can hold these arguments.*teacher"):
+        with pytest.raises(ValueError, match=r"can hold these arguments.*teacher \(it is a model, and not the path"):
             TGRL.resume(tmp_path / "checkpoints", TwoViewBandit(length=4), device="cpu")
     again = {} if as_path else {"teacher": teacher}
     resumed = TGRL.resume(tmp_path / "checkpoints", TwoViewBandit(length=4), device="cpu", **again)

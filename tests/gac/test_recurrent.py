@@ -137,7 +137,7 @@ def _with_other_start(batch):
 
 
 def critic_loss_of(model, critic, batch):
-    return model.critic_loss("learner_critic", batch, batch.rewards).value.item()
+    return model.bellman_loss("learner_critic", batch, batch.rewards).value.item()
 
 
 @pytest.mark.parametrize("cls", ALGORITHMS)
