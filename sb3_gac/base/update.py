@@ -240,14 +240,18 @@ class NetworkTraining(FaultTolerance):
         :param roles: names of the policies
         """
 
-        def run(batch: Batch) -> list[Outputs]:
+        passes = [partial(self._outputs_of, role, batch) for role in roles]
+        return run_side_by_side(passes) if self._at_once and len(roles) == 2 else [one() for one in passes]
+
+    def _outputs_of(self, role: str, batch: Batch) -> Outputs:
+        def run(batch: Batch) -> Outputs:
             with self._precision():
-                return [batch.outputs(getattr(self.policy, role)) for role in roles]
+                return batch.outputs(getattr(self.policy, role))
 
         if not self._in_several_programs:
             return run(batch)
         with th.no_grad():
-            return self._compiled(roles, run, batch)
+            return self._compiled(role, run, batch)
 
     def now(self, role: str, outputs: Outputs, batch: Batch) -> Any:
         """
@@ -291,7 +295,7 @@ class NetworkTraining(FaultTolerance):
         self.refresh_schedules()
         self._at_once = self._branches_are_independent and th.get_num_threads() > 1
         settings = (getattr(self, name) for name in self.compiled_settings)
-        self._program_key = (self.policy, self.policy.optimizer_options, *settings)
+        self._program_key = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
         history: list[Metrics] = []
         with halved_threads(self._at_once):
             for _ in range(gradient_steps):
