@@ -59,6 +59,10 @@ def test_the_latest_episodes_alone_are_compared(model):
     assert len(model.returns["actor"]) == 3
 
 
+def test_more_episodes_are_not_better_ones(model):
+    assert _after(model, 10, actor=[1.0, 1.0, 1.0], auxiliary=[1.5]) == pytest.approx(0.9)
+
+
 def test_it_is_compared_now_and_then_and_not_twice_for_a_step_over_several(model):
     episodes = {"actor": [1.0], "auxiliary": [0.0]}
     assert _after(model, 9, **episodes) == 1.0
