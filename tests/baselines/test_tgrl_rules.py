@@ -175,11 +175,25 @@ def test_the_teacher_is_the_policy_that_collected():
 def test_sb3s_own_may_teach():
     teacher = SAC("MultiInputPolicy", TwoViewBandit(), device="cpu", policy_kwargs={"net_arch": [8]}, learning_starts=4)
     teacher.learn(12)
+    with th.no_grad():
+        teacher.actor.log_std.bias.add_(4.0)  # beyond its bound
     obs = _obs(teacher)
     mean, log_std, _ = teacher.actor.get_action_dist_params(obs)
     asked = FrozenPolicy(teacher)(obs)
     th.testing.assert_close(asked.mean, mean.detach())
     th.testing.assert_close(asked.log_std, log_std.detach())
+
+
+@pytest.mark.parametrize("cls", [AsymmetricSAC, GAC])
+def test_a_model_that_has_taught_may_train_on_and_what_is_asked_stays(cls):
+    teacher = _teacher(cls=cls, learning_rate=0.1)
+    frozen, obs = FrozenPolicy(teacher), _obs(teacher)
+    assert not any(p.requires_grad for p in frozen.parameters())
+    before = frozen(obs)
+    start = [p.detach().clone() for p in teacher.policy.deployed.parameters()]
+    teacher.learn(15)
+    assert all(not th.equal(p, q) for p, q in zip(teacher.policy.deployed.parameters(), start, strict=True))
+    th.testing.assert_close(frozen(obs), before, rtol=0, atol=0)
 
 
 def _asked(teacher, env):
