@@ -8,13 +8,14 @@ STEPS ?= 50000
 SEED ?= 0
 RUNS ?= runs
 SUITE ?= smoke
-EARLIER ?=
+# EARLIER is its former name
+REUSE_RESULTS ?= $(EARLIER)
 WORKERS ?= auto
 ARGS ?=
 
 BIN := $(VENV)/bin
 CODE := sb3_gac benchmarks tests
-OF_EARLIER := $(if $(EARLIER),--earlier $(EARLIER))
+REUSED := $(if $(REUSE_RESULTS),--reuse-results $(REUSE_RESULTS))
 
 .PHONY: train test mutants benchmark format lint type clean
 
@@ -37,8 +38,8 @@ mutants: $(VENV)/.installed-dev  ## would the tests notice? put in deliberate fa
 	$(BIN)/python -m tests.mutate $(ARGS)
 
 benchmark: $(VENV)/.installed-dev  ## runs of a suite, resumed if need be, to figure, tables and page in benchmarks/results/
-	$(BIN)/python -m benchmarks.launch benchmarks/suites/$(SUITE).yml $(OF_EARLIER)
-	$(BIN)/python -m benchmarks.aggregate benchmarks/suites/$(SUITE).yml $(OF_EARLIER) --out benchmarks/results/$(SUITE)
+	$(BIN)/python -m benchmarks.launch benchmarks/suites/$(SUITE).yml $(REUSED)
+	$(BIN)/python -m benchmarks.aggregate benchmarks/suites/$(SUITE).yml $(REUSED) --out benchmarks/results/$(SUITE)
 	$(BIN)/python -m benchmarks.report benchmarks/results/$(SUITE)
 
 format: $(VENV)/.installed-dev

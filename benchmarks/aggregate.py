@@ -4,8 +4,8 @@ Finished runs of a suite -> a tidy CSV, and scores as JSON::
     python -m benchmarks.aggregate benchmarks/suites/halfcheetah.yml --out benchmarks/results/halfcheetah
 
 A missing run is an error, not a smaller average; ``--complete-cells`` leaves out the suite's cells of which a run is missing,
-all of their runs, and names them in the results.  ``--earlier`` takes runs whose directories are elsewhere, or gone, from the
-results that they were aggregated to.  Intervals are stratified bootstraps of 95% (rliable, arXiv 2108.13264).
+all of their runs, and names them in the results.  ``--reuse-results`` takes runs whose directories are elsewhere, or gone,
+from the results that they were aggregated to.  Intervals are stratified bootstraps of 95% (rliable, arXiv 2108.13264).
 """
 
 import argparse
@@ -25,13 +25,13 @@ from benchmarks.finished import (
     NEEDED,
     NO_NOISE,
     FinishedRun,
-    add_earlier_options,
+    add_reuse_options,
     kind_of,
     name_of,
     names_of,
     particulars_of,
     read_directory,
-    read_earlier,
+    read_reused,
     read_tidy,
     settings_of,
 )
@@ -44,21 +44,21 @@ BOOTSTRAPS = 2_000
 
 
 def finished_runs(
-    suite: Path, runs: Path, complete_cells: bool = False, earlier: Sequence[Path] = (), renewed: Sequence[str] = ()
+    suite: Path, runs: Path, complete_cells: bool = False, reuse: Sequence[Path] = (), rerun: Sequence[str] = ()
 ) -> tuple[list[FinishedRun], list[str]]:
     """
     :param suite: YAML file
     :param runs: directory of all runs
     :param complete_cells: whether a cell of which a run is missing is left out, instead of an error
-    :param earlier: results, without a suffix, whose runs count where there is no directory; the later over the earlier ones
-    :param renewed: algorithms of which they do not
+    :param reuse: results, without a suffix, whose runs count where there is no directory; the later over the earlier ones
+    :param rerun: algorithms of which they do not
     :return: the runs to count, and the names of those that are missing
     :raises FileNotFoundError: naming the runs that are not finished
     :raises ValueError: if a run was made with other settings
     """
     cells = read_cells(suite)
     specs = [spec for cell in cells for spec in cell]
-    found = read_earlier(earlier, specs, renewed)
+    found = read_reused(reuse, specs, rerun)
     found |= {name_of(spec): read_directory(spec, runs) for spec in specs if spec.is_finished(runs)}
     missing = [name for name in map(name_of, specs) if name not in found]
     names = [[name_of(spec) for spec in cell] for cell in cells]
@@ -270,7 +270,7 @@ def command(options: argparse.Namespace) -> str:
     :return: what makes the runs, or those that are not there, and then these results again, in a shell in the checkout
     """
     shared = [_from_checkout(options.suite), *_option("--runs", [options.runs] if options.runs != RUNS else [])]
-    shared += [*_option("--earlier", options.earlier), *_option("--renewed", options.renewed)]
+    shared += [*_option("--reuse-results", options.reuse_results), *_option("--rerun", options.rerun)]
     own = [*_option("--reference", [options.reference] if options.reference else []), *_option("--out", [options.out])]
     own += ["--complete-cells"] * options.complete_cells
     made = [["benchmarks.launch", *shared], ["benchmarks.aggregate", *shared, *own]]
@@ -321,9 +321,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
     parser.add_argument("--reference", help=f"to whose final return steps are counted: {REFERENCE}, or the first, by default")
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
-    add_earlier_options(parser)
+    add_reuse_options(parser)
     options = parser.parse_args()
-    runs, missing = finished_runs(options.suite, options.runs, options.complete_cells, options.earlier, options.renewed)
+    runs, missing = finished_runs(options.suite, options.runs, options.complete_cells, options.reuse_results, options.rerun)
     evaluations = options.out.with_suffix(".csv")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     table = collect(runs).replace({"noise": {NO_NOISE: np.nan}})

@@ -5,6 +5,7 @@ In order: the preset's arguments, those of the task, those of the task at that n
 for the classes from which the algorithm descends), the suite's overrides, the algorithm's own.
 """
 
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -13,6 +14,7 @@ from stable_baselines3.common.logger import Logger
 from benchmarks.environments import environment, make_envs
 from benchmarks.suite import RunSpec, check_keys, check_numbers, needed_runs, read_definitions, with_needed
 from sb3_gac.algorithms import algorithm_class
+from sb3_gac.base.arguments import present_names
 from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.presets import instantiate, merge, read_preset
 
@@ -99,7 +101,7 @@ def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
     if "buffer_size" in constructor_parameters(kind):
         resolved["buffer_size"] = min(1_000_000, max(spec.steps, 1_000))
     for layer in (*preset.layers(kind, task, spec.noise or 0.0), spec.overrides, own):
-        resolved = merge(resolved, layer)
+        resolved = merge(resolved, _present(spec.algorithm, kind, layer))
     needed = needed_runs(spec)
     if both := sorted(set(needed) & set(resolved)):
         raise ValueError(f"{spec.algorithm}: {both} are what it needs, and among its arguments too.")
@@ -107,10 +109,46 @@ def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
     policies, policy = kind.policy_aliases, resolved.get("policy", POLICY)  # type: ignore[attr-defined]
     if policy not in policies:
         raise ValueError(f"{spec.algorithm}: policy must be one of {sorted(policies)}, got {policy!r}.")
-    of_policy = resolved.get("policy_kwargs") or {}
+    of_policy = _present(f"{spec.algorithm}, policy_kwargs", policies[policy], resolved.get("policy_kwargs") or {})
+    resolved |= {"policy_kwargs": of_policy} if of_policy else {}
     _check_known(f"{spec.algorithm}, policy_kwargs", of_policy, policies[policy], _GIVEN_TO_POLICIES)
     check_numbers(spec.algorithm, resolved)
     return kind, resolved
+
+
+def _present(where: str, kind: type, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments by their present names; which of them had former ones is said."""
+    try:
+        present = present_names(kind, given, None)
+    except TypeError as error:
+        raise ValueError(f"{where}: {error}") from None
+    for former in sorted(set(given) - set(present)):
+        (now,) = present_names(kind, {former: None}, None)
+        warnings.warn(f'{where}: "{former}" is "{now}" now.', FutureWarning, stacklevel=3)  # whoever writes a suite sees it
+    return present
+
+
+def in_present_names(kind: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param kind: class of an algorithm
+    :param arguments: of it, as they were recorded
+    :return: the same, those of its policy included, by the names that they have now
+    """
+    present = present_names(kind, arguments, None)
+    policy_class = kind.policy_aliases.get(present.get("policy", POLICY))  # type: ignore[attr-defined]
+    if present.get("policy_kwargs") and policy_class is not None:
+        present["policy_kwargs"] = present_names(policy_class, present["policy_kwargs"], None)
+    return present
+
+
+def settings_in_present_names(kind: type, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param kind: class of the algorithm
+    :param settings: of runs, as they were recorded
+    :return: the same, with the arguments that a suite has among them by the names that they have now
+    """
+    layers = {name: settings[name] for name in ("overrides", "definition") if settings.get(name)}
+    return {**settings, **{name: in_present_names(kind, layer) for name, layer in layers.items()}}
 
 
 def _check_known(where: str, arguments: Mapping[str, Any], taker: type, given: set[str]) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 import yaml
 
-from benchmarks.config import resolve
+from benchmarks.config import in_present_names, read_algorithm, resolve, settings_in_present_names
 from benchmarks.suite import RunSpec, made_with
 
 #: What tells a suite's runs apart
@@ -105,32 +106,43 @@ def read_directory(spec: RunSpec, runs: Path) -> FinishedRun:
     return FinishedRun(
         spec,
         pd.read_csv(directory / "evaluations.csv"),
-        configuration["arguments"],
+        _recorded_arguments(spec, configuration["arguments"]),
         made_with(configuration),
         json.loads((directory / "timing.json").read_text())["seconds"],
         configuration["cpus"],
     )
 
 
-def add_earlier_options(parser: argparse.ArgumentParser) -> None:
-    """
-    :param parser: of a program that counts earlier runs, see :func:`read_earlier`
-    """
-    parser.add_argument(
-        "--earlier", type=Path, nargs="+", default=(), help="results, without a suffix, whose runs count where --runs has none"
-    )
-    parser.add_argument("--renewed", nargs="+", default=(), metavar="ALGORITHM", help="whose earlier runs do not count")
+class _FormerName(argparse.Action):
+    """Of an option, for one release: it does what the present one does, and says so."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option_string: Any = None) -> None:
+        present = "--" + self.dest.replace("_", "-")
+        print(f"{parser.prog}: DeprecationWarning: {option_string} is {present} now.", file=sys.stderr)
+        setattr(namespace, self.dest, values)
 
 
-def read_earlier(earlier: Sequence[Path], specs: Sequence[RunSpec], renewed: Sequence[str]) -> dict[str, FinishedRun]:
+def add_reuse_options(parser: argparse.ArgumentParser) -> None:
     """
-    :param earlier: results, without a suffix; the later over the earlier ones
+    :param parser: of a program that counts runs which were made elsewhere, see :func:`read_reused`
+    """
+    results: dict[str, Any] = {"dest": "reuse_results", "type": Path, "nargs": "+", "default": ()}
+    rerun: dict[str, Any] = {"dest": "rerun", "nargs": "+", "default": (), "metavar": "ALGORITHM"}
+    parser.add_argument("--reuse-results", **results, help="without a suffix: their runs count where --runs has none")
+    parser.add_argument("--rerun", **rerun, help="whose runs in --reuse-results do not count")
+    parser.add_argument("--earlier", **results, action=_FormerName, help=argparse.SUPPRESS)
+    parser.add_argument("--renewed", **rerun, action=_FormerName, help=argparse.SUPPRESS)
+
+
+def read_reused(results: Sequence[Path], specs: Sequence[RunSpec], rerun: Sequence[str]) -> dict[str, FinishedRun]:
+    """
+    :param results: of earlier runs, without a suffix; the later over the earlier ones
     :param specs: of runs that may be among them
-    :param renewed: algorithms whose runs do not count
+    :param rerun: algorithms whose runs do not count
     :return: name -> those that are, see :func:`read_results`
     """
-    wanted = [spec for spec in specs if spec.algorithm not in renewed]
-    return {name: run for results in earlier for name, run in read_results(results, wanted).items()}
+    wanted = [spec for spec in specs if spec.algorithm not in rerun]
+    return {name: run for path in results for name, run in read_results(path, wanted).items()}
 
 
 def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]:
@@ -148,16 +160,24 @@ def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]
 
 
 def _is_among(results: Mapping[str, Any], spec: RunSpec) -> bool:
-    return (
-        name_of(spec) in results["runs"]
-        and results["settings"] == settings_of(spec)
-        and results["arguments"][kind_of(spec)] == resolve(spec)[1]
-        and results.get("particulars", {}).get(kind_of(spec), {}) == particulars_of(spec)
+    if name_of(spec) not in results["runs"]:
+        return False
+    kind, arguments = resolve(spec)
+    recorded = results["settings"], results.get("particulars", {}).get(kind_of(spec), {})
+    now = settings_of(spec), particulars_of(spec)
+    return in_present_names(kind, results["arguments"][kind_of(spec)]) == arguments and all(
+        settings_in_present_names(kind, before) == settings_in_present_names(kind, after)
+        for before, after in zip(recorded, now, strict=True)
     )
+
+
+def _recorded_arguments(spec: RunSpec, recorded: Mapping[str, Any]) -> dict[str, Any]:
+    return in_present_names(read_algorithm(spec.algorithm, spec.definition)[0], recorded)
 
 
 def _recorded(spec: RunSpec, results: Mapping[str, Any], evaluations: Mapping[Any, pd.DataFrame]) -> FinishedRun:
     of_run = results["runs"][name_of(spec)]
     rows = evaluations[tuple(names_of(spec).values())].drop(columns=NAMES).dropna(axis=1, how="all")
     origins = [results["made_with"][index] for index in of_run["made_with"]]
-    return FinishedRun(spec, rows, results["arguments"][kind_of(spec)], origins, of_run["seconds"], results["cpus"])
+    arguments = _recorded_arguments(spec, results["arguments"][kind_of(spec)])
+    return FinishedRun(spec, rows, arguments, origins, of_run["seconds"], results["cpus"])

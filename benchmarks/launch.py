@@ -4,7 +4,7 @@ A suite -> its runs, several side by side with one thread each::
     python -m benchmarks.launch benchmarks/suites/halfcheetah.yml --jobs 2
 
 Finished runs are skipped and unfinished ones go on from their checkpoints, so an interrupted launch is resumed by the same
-command; runs whose directories are elsewhere, or gone, count as finished if ``--earlier`` results have them.  A failed run is
+command; runs whose directories are elsewhere, or gone, count as finished if ``--reuse-results`` have them.  A failed run is
 tried again.  What a run needs another run's model for comes first, once for all that need it; where that fails, they are not
 started.  ``--dry-run`` prints the commands of what is left to do.  ``--engine ray`` runs on a Ray cluster whose nodes
 share this checkout, its Python and the runs' directory.
@@ -30,7 +30,7 @@ from rich.text import Text
 
 from benchmarks.config import check_runs
 from benchmarks.engines import Engine, LocalEngine, RayEngine
-from benchmarks.finished import add_earlier_options, name_of, read_earlier
+from benchmarks.finished import add_reuse_options, name_of, read_reused
 from benchmarks.run import model_of
 from benchmarks.suite import RUNS, RunSpec, needed_runs, read_suite
 
@@ -74,18 +74,18 @@ class Job:
         return self.directory / "log.txt"
 
 
-def jobs_left(suite: Path, runs: Path, earlier: Sequence[Path] = (), renewed: Sequence[str] = ()) -> tuple[list[Job], int]:
+def jobs_left(suite: Path, runs: Path, reuse: Sequence[Path] = (), rerun: Sequence[str] = ()) -> tuple[list[Job], int]:
     """
     :param suite: YAML file
     :param runs: directory of all runs
-    :param earlier: results, without a suffix, whose runs are finished too
-    :param renewed: algorithms of which they are not
+    :param reuse: results, without a suffix, whose runs are finished too
+    :param rerun: algorithms of which they are not
     :return: the runs that are not finished, those first that others need; and how many of the suite's are finished
     :raises ValueError: naming what is wrong with the suite
     """
     specs = read_suite(suite)
     check_runs(suite.name, specs)
-    made = read_earlier(earlier, specs, renewed)
+    made = read_reused(reuse, specs, rerun)
     left = [(index, spec) for index, spec in enumerate(specs) if not spec.is_finished(runs) and name_of(spec) not in made]
     jobs: dict[str, Job] = {}
     for index, spec in left:
@@ -279,11 +279,11 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, help="runs side by side; default: one on each CPU")
     parser.add_argument("--retries", type=int, default=1, help="further attempts after a run that failed")
     parser.add_argument("--runs", type=Path, default=RUNS)
-    add_earlier_options(parser)
+    add_reuse_options(parser)
     parser.add_argument("--dry-run", action="store_true", help="print the commands of what is left to do")
     options = parser.parse_args()
     try:
-        jobs, finished = jobs_left(options.suite.resolve(), options.runs.resolve(), options.earlier, options.renewed)
+        jobs, finished = jobs_left(options.suite.resolve(), options.runs.resolve(), options.reuse_results, options.rerun)
     except ValueError as error:
         sys.exit(str(error))
     if options.dry_run:

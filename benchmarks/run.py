@@ -28,7 +28,7 @@ from stable_baselines3.common.logger import configure
 
 import sb3_gac
 from benchmarks.checkpoint import checkpoints_of, locked, write_atomically
-from benchmarks.config import POLICY, resolve
+from benchmarks.config import POLICY, in_present_names, resolve, settings_in_present_names
 from benchmarks.environments import make_envs
 from benchmarks.suite import HERE, RUNS, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.presets import instantiate
@@ -68,7 +68,7 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     with locked(directory):
         algorithm_class, arguments = resolve(spec)
         configuration = {"run": dataclasses.asdict(spec), "arguments": arguments}
-        _refuse_other_settings(directory / CONFIGURATION, configuration)
+        _refuse_other_settings(directory / CONFIGURATION, algorithm_class, configuration)
         history = _train(spec, directory, algorithm_class, configuration, models, progress_bar)
         write_evaluations(history, directory / "evaluations.csv")
         checkpoints_of(algorithm_class, directory).remove()
@@ -90,13 +90,21 @@ def model_of(spec: RunSpec, root: Path) -> Path:
     return path
 
 
-def _refuse_other_settings(path: Path, configuration: dict[str, Any]) -> None:
+def _refuse_other_settings(path: Path, algorithm_class: type, configuration: dict[str, Any]) -> None:
     """What was written by a process that did not come to the end must have been the same: two runs are never mixed."""
     if path.exists():
         before = yaml.safe_load(path.read_text())
-        changed = [key for key in configuration if before.get(key) != configuration[key]]
+        now, then = (_comparable(algorithm_class, one) for one in (configuration, before))
+        changed = [key for key in configuration if then.get(key) != now[key]]
         if changed:
             raise ValueError(f"{path.parent} holds an unfinished run with other settings under {changed}: remove it first.")
+
+
+def _comparable(algorithm_class: type, configuration: dict[str, Any]) -> dict[str, Any]:
+    """With arguments by their present names."""
+    arguments = in_present_names(algorithm_class, configuration.get("arguments") or {})
+    run = settings_in_present_names(algorithm_class, configuration.get("run") or {})
+    return {**configuration, "run": run, "arguments": arguments}
 
 
 def _write_configuration(path: Path, configuration: dict[str, Any], resumed: bool) -> None:

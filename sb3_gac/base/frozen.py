@@ -3,6 +3,7 @@
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ from sb3_gac.math.distributions import TanhGaussian
 
 class FrozenPolicy(nn.Module):
     """
-    The policy with which a trained model collected its data, on full observations; nothing trains it.
+    The policy with which a trained model collected its data, on full observations; a copy, which
+    nothing trains.
 
     :param model: of this package, or SB3's SAC on a Dict space
     :param name: of the argument, for messages
@@ -35,7 +37,7 @@ class FrozenPolicy(nn.Module):
         super().__init__()
         if not (isinstance(model, SAC) or isinstance(getattr(model, "policy", None), AsymmetricPolicy)):
             raise TypeError(f"{name} must be a model of sb3_gac, or SB3's SAC on a Dict space, got {type(model).__name__}.")
-        self.policy = model.policy
+        self.policy = deepcopy(model.policy)  # the model itself may train on
         if isinstance(self.policy, AsymmetricPolicy) and any(self.policy.rnn_types.values()):
             raise ValueError(f"{name} has a memory, and it is asked about single transitions: train one without.")
         self.requires_grad_(False)

@@ -11,7 +11,7 @@ import torch as th
 import torch.nn.functional as F
 
 from sb3_gac.checks.values import check_range
-from sb3_gac.math.losses import dual_loss, masked_mean
+from sb3_gac.math.losses import dual_loss
 from sb3_gac.optim.trained import TrainedParameters, adam_step
 
 
@@ -163,11 +163,19 @@ class SoftplusDual:
         assert self._trained.adam is not None
         assert self.optimizer is not None
         with th.no_grad():
-            mean = violation.reshape(-1, *self.shape).mean(dim=0) if mask is None else masked_mean(violation, mask)
+            mean = self._mean(violation, mask)
             value, slope = self._value_and_slope(self.parameter)
             adam_step(self._trained.adam, [-slope * mean], self.optimizer.param_groups[0])
             self.parameter.clamp_(*self._parameter_bounds)
         return {f"{self.name}_loss": dual_loss(value, mean)}
+
+    def _mean(self, violation: th.Tensor, mask: th.Tensor | None) -> th.Tensor:
+        """Of each coefficient, over the samples that count."""
+        samples = violation.reshape(-1, *self.shape)
+        if mask is None:
+            return samples.mean(dim=0)
+        counts = (mask.flatten() > 0).view(-1, *(1 for _ in self.shape))
+        return samples.where(counts, 0.0).sum(dim=0) / counts.sum().clamp(min=1)
 
 
 class DualVariable(SoftplusDual):

@@ -1,53 +1,114 @@
-"""Who collects the data: also a policy that nothing trains."""
+"""Which policy collects: one, or shares of episodes or of environments, and each from an episode's start to its end."""
 
+import numpy as np
 import pytest
-import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_gac import TGRL, AsymmetricSAC
-from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
+from sb3_gac import GAC, AsymmetricSAC, GACShare
+from sb3_gac.base.behaviour import Behaviour
+from sb3_gac.base.roles import Roles
+from tests.helpers import TwoViewBandit, small_model, unlike_each_other
 
-ALWAYS_ALIKE = {"net_arch": [8], "log_std_bounds": (-20.0, -19.0)}
-
-
-def _teacher(env):
-    keys = {"actor": ["partial", "privileged"]}
-    return AsymmetricSAC("MultiInputPolicy", env, role_keys=keys, policy_kwargs=ALWAYS_ALIKE, device="cpu", seed=1)
+ROLES = Roles("learner", ("guider", "other"), ("critic",), collects="guider")
+STARTS = np.ones(4, dtype=bool)
 
 
-def _stored(model):
-    buffer = model.replay_buffer
-    rows = slice(10, buffer.n_added)
-    observations = {key: th.as_tensor(entry[rows, 0]) for key, entry in buffer.observations.items()}
-    return observations, th.as_tensor(buffer.actions[rows, 0])
+def test_without_a_word_the_collecting_policy_acts_and_by_name_another_one():
+    assert Behaviour(ROLES, None).choose(["learner"] * 4, STARTS, 1.0) == ["guider"] * 4
+    assert Behaviour(ROLES, "learner").choose(["guider"] * 4, STARTS, 1.0) == ["learner"] * 4
 
 
-def test_a_frozen_teacher_acts_where_behaviour_names_it():
-    env = TwoViewBandit(length=3)
-    model = small_model(env, cls=TGRL, teacher=_teacher(env), behaviour="teacher").learn(40)
-    observations, actions = _stored(model)
-    expected = model.frozen["teacher"](observations).mode
-    assert actions.std() > 0
-    th.testing.assert_close(actions, expected, atol=1e-5, rtol=0)
+def test_shares_are_shares_of_episodes_drawn_anew_at_each_start():
+    np.random.seed(0)
+    behaviour = Behaviour(ROLES, {"learner": 0.2, "other": 0.3})
+    acting = ["guider"] * 4
+    seen = []
+    for _ in range(1000):
+        acting = behaviour.choose(acting, STARTS, 1.0)
+        seen.append(acting)
+    for env in zip(*seen, strict=True):  # each environment by itself
+        shares = [env.count(role) / len(env) for role in ("learner", "other", "guider")]
+        assert shares == pytest.approx([0.2, 0.3, 0.5], abs=0.05)
+    together = np.mean([first == "learner" and second == "learner" for first, second, *_ in seen])
+    assert together == pytest.approx(0.04, abs=0.02), "environments are drawn for by themselves"
 
 
-def test_a_share_of_the_episodes_is_the_frozen_teachers():
-    env = TwoViewBandit(length=3)
-    model = small_model(env, cls=TGRL, teacher=_teacher(env), behaviour={"teacher": 0.5, "auxiliary": 0.5}).learn(310)
-    observations, actions = _stored(model)
-    are_its = ((model.frozen["teacher"](observations).mode - actions).abs() < 1e-5).numpy().mean()
-    assert 0.3 < are_its < 0.7
-    assert len(model.returns["auxiliary"]) > 0
-    assert len(model.returns["actor"]) == 0
+@pytest.mark.parametrize("per", ["episode", "environment"])
+def test_whoever_has_begun_an_episode_ends_it(per):
+    behaviour = Behaviour(ROLES, {"learner": 1.0}, per)
+    acting = ["guider", "other", "guider", "other"]
+    assert behaviour.choose(acting, np.array([True, False, False, True]), 1.0) == ["learner", "other", "guider", "learner"]
+    assert behaviour.choose(acting, ~STARTS, 1.0) == acting
 
 
-def test_a_frozen_teacher_names_discrete_actions():
-    env = TwoViewChoice(length=3)
-    model = small_model(env, cls=TGRL, teacher=_teacher(env), behaviour="teacher").learn(20)
-    _, actions = _stored(model)
-    assert set(actions.flatten().tolist()) <= {0, 1, 2}
+@pytest.mark.parametrize(("share", "n_envs", "expected"), [(0.25, 4, 1), (0.5, 4, 2), (0.34, 3, 1), (0.0, 2, 0), (1.0, 2, 2)])
+def test_shares_of_environments_are_the_same_ones_at_each_start(share, n_envs, expected):
+    behaviour = Behaviour(ROLES, {"learner": share}, "environment")
+    acting = ["guider"] * n_envs
+    for _ in range(5):
+        acting = behaviour.choose(acting, np.ones(n_envs, dtype=bool), 1.0)
+        assert acting == ["learner"] * expected + ["guider"] * (n_envs - expected)
 
 
-def test_a_name_of_nobody_is_refused():
-    env = TwoViewBandit()
-    with pytest.raises(ValueError, match=r"behaviour: a policy must be one of .*'teacher'.*, got 'guider'"):
-        small_model(env, cls=TGRL, teacher=_teacher(env), behaviour="guider")
+def test_a_share_may_be_a_schedule():
+    behaviour = Behaviour(ROLES, {"learner": lambda progress_remaining: 1 - progress_remaining})
+    assert behaviour.choose(["guider"] * 4, STARTS, 1.0) == ["guider"] * 4
+    assert behaviour.choose(["guider"] * 4, STARTS, 0.0) == ["learner"] * 4
+
+
+@pytest.mark.parametrize("shares", [{"learner": 1.2}, {"learner": -0.1}, {"learner": 0.6, "other": 0.6}])
+def test_shares_that_are_none_are_refused(shares):
+    with pytest.raises(ValueError, match="behaviour must be shares from 0 to 1"):
+        Behaviour(ROLES, shares)
+
+
+@pytest.mark.parametrize("behaviour", ["critic", "nobody", {"critic": 0.5}])
+def test_who_is_no_policy_is_refused(behaviour):
+    with pytest.raises(ValueError, match="behaviour"):
+        Behaviour(ROLES, behaviour)
+
+
+@pytest.mark.parametrize("cls", [GAC, GACShare])
+def test_in_each_environment_the_one_whose_turn_it_is_acts(cls):
+    policy = small_model(cls=cls).policy
+    unlike_each_other(policy)
+    obs = {"partial": np.random.randn(3, 2).astype(np.float32), "privileged": np.random.randn(3, 1).astype(np.float32)}
+
+    def actions(*acting):
+        return policy.behaviour_action(obs, deterministic=True, acting=acting)[0]
+
+    guider, learner = actions(*["guider"] * 3), actions(*["learner"] * 3)
+    assert (np.abs(guider - learner) > 1e-3).all()
+    np.testing.assert_array_equal(actions("guider", "learner", "guider"), np.stack([guider[0], learner[1], guider[2]]))
+    np.testing.assert_array_equal(actions("learner", "guider", "guider"), np.stack([learner[0], guider[1], guider[2]]))
+    np.testing.assert_array_equal(policy.behaviour_action(obs, deterministic=True)[0], guider)
+
+
+def _episodes(model, steps):
+    """Environment, return and role of each episode that ends."""
+    ended = []
+    model.on_episode_end = lambda env, episode_return, role: ended.append((env, episode_return, role))
+    model.learn(steps)
+    return ended
+
+
+def test_a_model_collects_as_it_is_told_to():
+    env = DummyVecEnv([lambda: TwoViewBandit(length=3)] * 2)
+    model = small_model(env, behaviour={"learner": 0.5}, behaviour_per="environment", learning_starts=0)
+    assert {(env, role) for env, _, role in _episodes(model, 24)} == {(0, "learner"), (1, "guider")}
+    model = small_model(env, behaviour={"learner": 0.5}, learning_starts=0)
+    assert {(env, role) for env, _, role in _episodes(model, 200)} == {(n, r) for n in (0, 1) for r in ("learner", "guider")}
+
+
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+def test_an_episode_that_warm_up_had_a_part_in_is_nobodys(cls):
+    """Its return is its own all the same."""
+    env = DummyVecEnv([lambda length=length: TwoViewBandit(length=length) for length in (3, 4)])
+    model = small_model(env, cls, learning_starts=9, buffer_size=100)  # five steps of both environments
+    ended = _episodes(model, 24)
+    role = model.policy.roles.behaviour
+    assert [role for env, _, role in ended if env == 0] == [None, None, role, role]
+    assert [role for env, _, role in ended if env == 1] == [None, None, role]
+    rewards = model.replay_buffer.rewards[:12, 0].reshape(4, 3)
+    returns = [episode_return for env, episode_return, _ in ended if env == 0]
+    assert returns == pytest.approx(rewards.sum(axis=1).tolist(), rel=1e-5)

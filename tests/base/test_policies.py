@@ -6,7 +6,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare
-from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice, optimizers_of, small_model
+from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice, optimizers_of, small_model, unlike_each_other
 
 IMAGE = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=spaces.Box(-1, 1, (2,), np.float32))
 CNN = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}, "share_features_extractor": True}
@@ -85,3 +85,21 @@ def test_a_policy_that_is_saved_by_itself_is_the_same_again(cls, tmp_path):
     for optimizer in optimizers_of(again):
         assert type(optimizer) is th.optim.AdamW
         assert optimizer.param_groups[0]["weight_decay"] == 0.25
+
+
+@pytest.mark.parametrize(
+    ("cls", "options"),
+    [
+        (GAC, {"guider": "independent", "shared_std": "guider", "max_kl": 0.01, "kl_reduction": "sum"}),
+        (GACShare, {"guider": "residual", "shared_std": "learner"}),
+    ],
+)
+def test_a_policy_of_ones_own_options_that_is_saved_by_itself_is_the_same_again(cls, options, tmp_path):
+    policy = small_model(cls=cls, **options).policy
+    unlike_each_other(policy, 1.0)
+    policy.save(tmp_path / "policy")
+    again = type(policy).load(tmp_path / "policy")
+    obs = {"partial": th.randn(7, 2), "privileged": th.randn(7, 1)}
+    for ours, theirs in zip(policy.distributions(obs), again.distributions(obs), strict=True):
+        th.testing.assert_close(ours, theirs)
+    assert (policy.learner_critic is None) == (again.learner_critic is None) == (cls is GACShare)

@@ -147,12 +147,12 @@ def test_from_suite_to_report_beside_a_task_with_noise(suite, tmp_path, monkeypa
     assert "gac, Pendulum, noise 0.1" not in results["particulars"]
     assert [(cell["task"], cell["noise"]) for cell in results["compared"]["cells"]] == [("Pendulum", 0.1), ("my-line", None)]
 
-    counted, missing = finished_runs(path, tmp_path / "elsewhere", earlier=[out])
+    counted, missing = finished_runs(path, tmp_path / "elsewhere", reuse=[out])
     assert [name_of(run.spec) for run in counted] == [name_of(job.spec) for job in jobs]
     assert not missing
     changed = suite(OWN | {"env_kwargs": {"difficulty": 4}, "algorithms": ["gac", "sac-asym"]}, pendulum)
     with pytest.raises(FileNotFoundError, match="2 runs are not finished"):
-        finished_runs(changed, tmp_path / "elsewhere", earlier=[out])
+        finished_runs(changed, tmp_path / "elsewhere", reuse=[out])
     with pytest.raises(ValueError, match=r"other settings under \['environment'\]"):
         jobs_left(changed, runs)
 

@@ -184,7 +184,7 @@ def test_steps_of_needed_runs_are_told_apart_and_counted(launched, tmp_path, mon
     results = json.loads(out.with_suffix(".json").read_text())
     assert [cell.get("needed_steps") for cell in results["cells"]] == [40, None]
     assert results["particulars"]["taught, Pendulum, noise 0.1"]["needs"] == OWN["taught"]["needs"]
-    counted, _ = finished_runs(path, tmp_path, earlier=[out])
+    counted, _ = finished_runs(path, tmp_path, reuse=[out])
     assert [run.evaluations.columns.tolist().count("needed_steps") for run in counted] == [0, 0], "it is added again"
     pd.testing.assert_frame_equal(benchmarks.aggregate.collect(counted), table, check_dtype=False, check_like=True)
 

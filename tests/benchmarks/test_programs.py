@@ -1,11 +1,13 @@
 """The benchmark programs, run as a user runs them, on a suite of seconds."""
 
+import importlib
 import json
 import re
 import shutil
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,7 +27,7 @@ from benchmarks.aggregate import finished_runs, origins
 from benchmarks.checkpoint import SB3Checkpoints, checkpoints_of, locked
 from benchmarks.config import check_runs, read_algorithm, resolve
 from benchmarks.environments import environment
-from benchmarks.finished import kind_of, name_of
+from benchmarks.finished import kind_of, name_of, names_of, particulars_of, read_reused, settings_of
 from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
 from benchmarks.suite import RunSpec, made_with, read_suite
@@ -133,7 +135,7 @@ def test_runs_without_their_directories_count_by_the_results_that_they_went_into
     program = ("benchmarks.aggregate", SMOKE, "--runs")
     assert _program(*program, runs, "--out", tmp_path / "made").returncode == 0
     elsewhere = tmp_path / "elsewhere"
-    result = _program(*program, elsewhere, "--earlier", tmp_path / "made", "--out", tmp_path / "again")
+    result = _program(*program, elsewhere, "--reuse-results", tmp_path / "made", "--out", tmp_path / "again")
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "made.csv").read_text() == (tmp_path / "again.csv").read_text()
     made, again = (json.loads((tmp_path / name).read_text()) for name in ("made.json", "again.json"))
@@ -146,31 +148,57 @@ def test_runs_without_their_directories_count_by_the_results_that_they_went_into
     shutil.copytree(runs / names[0], elsewhere / names[0])
     table = pd.read_csv(elsewhere / names[0] / "evaluations.csv")
     table.assign(learner=7.0).to_csv(elsewhere / names[0] / "evaluations.csv", index=False)
-    counted, missing = finished_runs(SMOKE, elsewhere, earlier=[tmp_path / "made"])
+    counted, missing = finished_runs(SMOKE, elsewhere, reuse=[tmp_path / "made"])
     assert [run.name for run in counted] == names
     assert not missing
     assert (counted[0].evaluations.learner == 7.0).all(), "a directory comes before what was made earlier"
     table = pd.read_csv(tmp_path / "made.csv")
     table.assign(learner=8.0).to_csv(tmp_path / "later.csv", index=False)
     shutil.copy(tmp_path / "made.json", tmp_path / "later.json")
-    counted, _ = finished_runs(SMOKE, elsewhere, earlier=[tmp_path / "made", tmp_path / "later"])
+    counted, _ = finished_runs(SMOKE, elsewhere, reuse=[tmp_path / "made", tmp_path / "later"])
     assert [run.evaluations.learner.iloc[0] for run in counted] == [7.0, 8.0, 8.0, 8.0], "the last of several counts"
-    _, missing = finished_runs(SMOKE, runs, True, [tmp_path / "made"], renewed=["gac"])
+    _, missing = finished_runs(SMOKE, runs, True, [tmp_path / "made"], rerun=["gac"])
     assert not missing, "directories count in any case"
     with pytest.raises(FileNotFoundError, match=f"1 runs are not finished in .*{names[2]}"):
-        finished_runs(SMOKE, elsewhere, earlier=[tmp_path / "made"], renewed=["gac"])
+        finished_runs(SMOKE, elsewhere, reuse=[tmp_path / "made"], rerun=["gac"])
 
 
 def test_launch_leaves_out_what_earlier_results_have(runs, tmp_path):
     made = tmp_path / "made"
     assert _program("benchmarks.aggregate", SMOKE, "--runs", runs, "--out", made).returncode == 0
-    command = ("benchmarks.launch", SMOKE, "--runs", tmp_path / "elsewhere", "--earlier", made)
+    command = ("benchmarks.launch", SMOKE, "--runs", tmp_path / "elsewhere", "--reuse-results", made)
     assert "4 were finished before, 0 now, 0 failed." in _program(*command).stdout
-    jobs, finished = jobs_left(SMOKE, tmp_path / "elsewhere", [made], renewed=["gac"])
+    jobs, finished = jobs_left(SMOKE, tmp_path / "elsewhere", [made], rerun=["gac"])
     assert finished == 2
     assert [job.spec.algorithm for job in jobs] == ["gac", "gac"]
     shutil.copytree(jobs[0].spec.directory(runs), jobs[0].directory)
-    assert jobs_left(SMOKE, tmp_path / "elsewhere", [made], renewed=["gac"])[1] == 3, "a directory counts in any case"
+    assert jobs_left(SMOKE, tmp_path / "elsewhere", [made], rerun=["gac"])[1] == 3, "a directory counts in any case"
+
+
+@pytest.mark.parametrize("program", ["benchmarks.launch", "benchmarks.aggregate"])
+def test_former_names_of_options_work_for_one_release_and_are_not_shown(program, capsys, monkeypatch):
+    """They say what they are called now, where errors are said."""
+    module = importlib.import_module(program)
+    seen = {}
+    reads = {"benchmarks.launch": "jobs_left", "benchmarks.aggregate": "finished_runs"}[program]
+    monkeypatch.setattr(module, reads, lambda *args: seen.update(args=args) or sys.exit(7))
+    options = [program, str(SMOKE), *(["--out", "there"] if program == "benchmarks.aggregate" else [])]
+    for names, said in ((("--reuse-results", "--rerun"), False), (("--earlier", "--renewed"), True)):
+        monkeypatch.setattr(sys, "argv", [*options, names[0], "one", "two", names[1], "gac"])
+        with pytest.raises(SystemExit, match="7"):
+            module.main()
+        assert seen["args"][-2:] == ([Path("one"), Path("two")], ["gac"])
+        error = capsys.readouterr().err
+        assert ("DeprecationWarning: --earlier is --reuse-results now." in error) == said
+        assert ("DeprecationWarning: --renewed is --rerun now." in error) == said
+    monkeypatch.setattr(sys, "argv", [program, "--help"])
+    with pytest.raises(SystemExit):
+        module.main()
+    printed = capsys.readouterr().out
+    assert "--reuse-results" in printed
+    assert "--rerun" in printed
+    assert "--earlier" not in printed
+    assert "--renewed" not in printed
 
 
 def test_hours_are_those_of_the_runs_that_were_timed(runs):
@@ -190,13 +218,13 @@ def test_earlier_runs_with_other_settings_do_not_count(runs, tmp_path, change):
     path = tmp_path / "changed.yml"
     path.write_text(yaml.safe_dump(suite))
     with pytest.raises(FileNotFoundError, match="4 runs are not finished"):
-        finished_runs(path, tmp_path, earlier=[tmp_path / "made"])
+        finished_runs(path, tmp_path, reuse=[tmp_path / "made"])
 
 
 def test_results_that_do_not_name_their_runs_are_refused(tmp_path):
     (tmp_path / "old.json").write_text("{}")
     with pytest.raises(ValueError, match="does not tell its runs apart"):
-        finished_runs(SMOKE, tmp_path, earlier=[tmp_path / "old"])
+        finished_runs(SMOKE, tmp_path, reuse=[tmp_path / "old"])
 
 
 def test_a_failing_run_is_named_with_its_log(tmp_path):
@@ -328,7 +356,7 @@ def test_launch_leaves_out_what_committed_results_have(tmp_path):
     jobs, finished = jobs_left(FIGURE, tmp_path, [RESULTS])
     assert [name_of(job.spec) for job in jobs] == [name_of(spec) for spec in specs if name_of(spec) not in recorded]
     assert finished == len(recorded)
-    jobs, finished = jobs_left(FIGURE, tmp_path, [RESULTS], renewed=["gac"])
+    jobs, finished = jobs_left(FIGURE, tmp_path, [RESULTS], rerun=["gac"])
     assert finished == len([name for name in recorded if "/gac/" not in name])
 
 
@@ -636,3 +664,86 @@ def test_a_finished_run_with_other_settings_is_neither_skipped_nor_counted(tmp_p
     for program in (lambda: run(spec, tmp_path), lambda: jobs_left(SMOKE, tmp_path), lambda: finished_runs(SMOKE, tmp_path)):
         with pytest.raises(ValueError, match=r"other settings under \['eval_episodes'\]: remove it, or use another --runs"):
             program()
+
+
+def _results_of(suite, path, change):
+    """Results that all runs of a suite went into, as nobody has made them, with other arguments."""
+    specs = read_suite(suite)
+    rows = [{**names_of(spec), "timesteps": 1, "learner": 1.0} for spec in specs]
+    pd.DataFrame(rows).to_csv(path.with_suffix(".csv"), index=False)
+    record = {
+        "settings": settings_of(specs[0]),
+        "arguments": {kind_of(spec): change(spec, resolve(spec)[1]) for spec in specs},
+        "particulars": {kind_of(spec): found for spec in specs if (found := particulars_of(spec))},
+        "runs": {name_of(spec): {"seconds": 1.0, "made_with": [0]} for spec in specs},
+        "made_with": [{"commit": "0"}],
+        "cpus": 1,
+    }
+    path.with_suffix(".json").write_text(json.dumps(record))
+    return specs
+
+
+STDS = ROOT / "benchmarks/suites/guider-std.yml"
+
+
+def _former(arguments):
+    return {"std_of" if name == "shared_std" else name: value for name, value in arguments.items()}
+
+
+def test_results_with_former_names_of_arguments_count(tmp_path):
+    """Those that are committed too, and what is made of them has the present names."""
+    specs = _results_of(STDS, tmp_path / "made", lambda spec, arguments: _former(arguments))
+    recorded = json.loads((tmp_path / "made.json").read_text())["arguments"]
+    assert any("std_of" in arguments for arguments in recorded.values()), "or nothing was tested"
+    counted, missing = finished_runs(STDS, tmp_path, reuse=[tmp_path / "made"])
+    assert not missing
+    assert [run.arguments for run in counted] == [resolve(spec)[1] for spec in specs]
+
+    _results_of(STDS, tmp_path / "other", lambda spec, arguments: _former(arguments) | {"std_of": "learner"})
+    assert not read_reused([tmp_path / "other"], specs, ()), "another value is another one by whatever name"
+    committed = ROOT / "benchmarks/results/guider-std"
+    made = [name for name in json.loads(committed.with_suffix(".json").read_text())["runs"] if "gac-guider-std" in name]
+    assert made
+    assert set(made) <= set(read_reused([committed], specs, ()))
+
+
+@pytest.mark.filterwarnings("ignore:.*std_of:FutureWarning")
+@pytest.mark.parametrize("where", ["overrides", "own", "policy_kwargs"])
+def test_a_suite_with_former_names_of_arguments_is_read_and_says_what_they_are_now(where, tmp_path):
+    """Its results are those of the same suite with present names, and the reverse."""
+    suite = yaml.safe_load(SMOKE.read_text())
+    cells = [suite["cells"][0] | {"algorithms": ["mine"]}]
+    paths = {}
+    for name in ("std_of", "shared_std"):
+        given = {"policy_kwargs": {name: "guider"}} if where == "policy_kwargs" else {name: "guider"}
+        mine = {"class": "gac", **(given if where == "own" else {})}
+        overrides = {} if where == "own" else given
+        (tmp_path / name).mkdir()
+        paths[name] = tmp_path / name / "suite.yml"
+        paths[name].write_text(yaml.safe_dump(suite | {"cells": cells, "algorithms": {"mine": mine}, "overrides": overrides}))
+    with pytest.warns(FutureWarning, match='"std_of" is "shared_std" now'):
+        former = [resolve(spec)[1] for spec in read_suite(paths["std_of"])]
+    assert former == [resolve(spec)[1] for spec in read_suite(paths["shared_std"])]
+    assert "guider" in str(former[0])
+    for name, other in (("std_of", "shared_std"), ("shared_std", "std_of")):
+        specs = _results_of(paths[name], tmp_path / name / "made", lambda spec, arguments: arguments)
+        assert len(read_reused([tmp_path / name / "made"], read_suite(paths[other]), ())) == len(specs)
+
+
+@pytest.mark.parametrize(("value", "goes_on"), [("guider", True), ("learner", False)])
+def test_a_run_that_was_begun_with_former_names_of_arguments_goes_on(value, goes_on, tmp_path):
+    path, settings = tmp_path / "config.yaml", {"steps": 1, "overrides": {"tau": 0.1, "shared_std": "guider"}}
+    now = {"run": settings, "arguments": {"tau": 0.1, "shared_std": "guider"}}
+    before = {"run": settings | {"overrides": {"tau": 0.1, "std_of": value}}, "arguments": {"tau": 0.1, "std_of": value}}
+    path.write_text(yaml.safe_dump(before | {"commit": "0"}))
+    with nullcontext() if goes_on else pytest.raises(ValueError, match=r"other settings under \['run', 'arguments'\]"):
+        benchmarks.run._refuse_other_settings(path, GAC, now)
+
+
+def test_an_argument_by_both_names_in_one_place_is_refused(tmp_path):
+    cells = [CELL | {"algorithms": ["mine"]}]
+    suite = {"steps": 1, "envs": 1, "preset": "small", "eval_every": 1, "eval_episodes": 1, "cells": cells}
+    suite["algorithms"] = {"mine": {"class": "gac", "std_of": "guider", "shared_std": "guider"}}
+    (tmp_path / "suite.yml").write_text(yaml.safe_dump(suite))
+    with pytest.raises(ValueError, match='mine: GAC got "shared_std" twice'):
+        resolve(read_suite(tmp_path / "suite.yml")[0])

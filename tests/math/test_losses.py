@@ -155,3 +155,17 @@ def test_a_target_of_another_shape_is_named(name, shape):
 def test_an_objective_of_another_shape_is_named(name, shape):
     with pytest.raises(ValueError, match=rf"^{name} must have the shape \(4,\)"):
         losses.policy_loss(q=th.ones(2, 4), ent_coef=0.1, kl_coef=0.1, **{name: th.ones(shape)})
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.5, 0.7, 0.95, 1.0])
+@pytest.mark.parametrize("n", [1, 7, 20])
+def test_a_quantile_is_the_smallest_value_that_the_share_does_not_exceed(n, share):
+    """With padding of any value between, and in whatever shape."""
+    values = th.linspace(-3, 2, n)[th.randperm(n)]
+    expected = next(value for value in values.sort().values if (values <= value).double().mean() >= share - 1e-6)
+    assert losses.masked_quantile(values, share) == expected
+    for padding in (-9.0, 0.0, 9.0):
+        padded = th.cat([values, th.full((n,), padding)]).view(2, n)
+        mask = th.cat([th.ones(n), th.zeros(n)]).view(2, n)
+        assert losses.masked_quantile(padded, share, mask) == expected
+        assert losses.masked_quantile(padded.T, share, mask.T) == expected

@@ -10,7 +10,7 @@ from sb3_gac.networks.critics import CriticEnsemble
 from sb3_gac.networks.encoders import VectorExtractor
 from sb3_gac.networks.layers import EnsembleLinear
 from sb3_gac.optim.polyak import polyak_average
-from tests.helpers import small_model
+from tests.helpers import Sampled, small_model
 
 SPACE = spaces.Dict(b=spaces.Box(-1, 1, (3,), np.float32), a=spaces.Box(-np.inf, np.inf, (2,), np.float32))
 
@@ -97,3 +97,32 @@ def test_polyak_average(tau):
     assert targets[0].tolist() == pytest.approx([5 - 4 * tau, 6 - 4 * tau])
     assert targets[1].item() == pytest.approx(4 * tau)
     assert parameters[0].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        spaces.Discrete(3),
+        spaces.Discrete(3, start=2),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.MultiBinary(2),
+        spaces.Box(-1, 1, (2, 3), np.float32),
+        spaces.Box(-1, 1, (), np.float32),
+    ],
+    ids=str,
+)
+def test_a_network_without_a_memory_takes_sequences_step_by_step(first):
+    """Policies and critics, whatever the kind of the entry that they see first."""
+    space = spaces.Dict(partial=first, privileged=spaces.Box(-1, 1, (2,), np.float32))
+    policy = small_model(Sampled(space)).policy
+    shape = (1,) if isinstance(first, spaces.Discrete) else first.shape
+    drawn = {key: np.stack([entry.sample() for _ in range(12)]) for key, entry in space.spaces.items()}
+    flat = {"partial": th.as_tensor(drawn["partial"]).view(12, *shape), "privileged": th.as_tensor(drawn["privileged"])}
+    sequence = {key: entry.unflatten(0, (4, 3)) for key, entry in flat.items()}
+    actions = th.rand(12, 1)
+    for role in ("learner", "guider"):
+        outputs = zip(getattr(policy, role).distribution(sequence), getattr(policy, role).distribution(flat), strict=True)
+        for at_once, one_by_one in outputs:
+            th.testing.assert_close(at_once, one_by_one.unflatten(0, (4, 3)))
+    q = policy.critic(sequence, actions.unflatten(0, (4, 3)))
+    th.testing.assert_close(q, policy.critic(flat, actions).unflatten(1, (4, 3)))

@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_gac import GAC, TGRL, AsymmetricSAC
+from sb3_gac.optim.compile import Program
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
 
 TEACHER = small_model(cls=AsymmetricSAC, role_keys={"actor": ["partial", "privileged"]})
@@ -150,3 +151,13 @@ def test_mixed_precision_leaves_the_last_layers_alone(env):
         plain = layer(x)
         with th.autocast("cpu", th.bfloat16):
             assert th.equal(layer(x), plain), name
+
+
+def test_each_program_has_code_of_its_own(monkeypatch):
+    """By which torch keeps what it has compiled."""
+    monkeypatch.setattr(th, "compile", lambda function, **options: function)
+    programs = [Program(function, th.device("cpu")) for function in (th.sin, th.cos, th.sin)]
+    assert len({id(program._run.__code__) for program in programs}) == 3
+    x = th.rand(3)
+    for program, function in zip(programs, (th.sin, th.cos, th.sin), strict=True):
+        assert th.equal(program(x), function(x))

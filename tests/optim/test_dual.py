@@ -3,7 +3,13 @@
 import pytest
 import torch as th
 
-from sb3_gac.optim.coefficients import DualVariable, FixedCoefficient, make_coefficient
+from sb3_gac.optim.coefficients import (
+    AdditiveCoefficient,
+    DualVariable,
+    FixedCoefficient,
+    SoftplusDual,
+    make_coefficient,
+)
 
 CPU = th.device("cpu")
 
@@ -98,3 +104,62 @@ def test_goes_on_from_another_one_inside_its_own_bounds_and_at_its_own_rate():
     state, gathered = (one.optimizer.state_dict()["state"][0] for one in (dual, other))
     assert th.equal(state["exp_avg"], gathered["exp_avg"])
     assert state["exp_avg"].item() != 0
+
+
+@pytest.mark.parametrize(("kind", "of"), [(SoftplusDual, th.nn.functional.softplus), (DualVariable, th.exp)])
+@pytest.mark.parametrize("shape", [(), (3,)])
+def test_learns_as_adam_does_from_the_gradient_of_its_loss(kind, of, shape):
+    """Each by itself, from violations of many sizes, so that the slope of each value counts."""
+    dual = kind("coef", 0.7, (1e-3, 50.0), 0.1, CPU, shape)
+    start = dual.parameter.detach().clone().requires_grad_()
+    assert of(start).detach().numpy() == pytest.approx(0.7)
+    plain = th.optim.Adam([start], lr=0.1)
+    generator = th.Generator().manual_seed(0)
+    for _ in range(8):
+        violation = th.randn(5, *shape, generator=generator).exp() - 1.3
+        loss = -(of(start).view(shape) * violation.mean(dim=0)).sum()
+        plain.zero_grad()
+        loss.backward()
+        plain.step()
+        th.testing.assert_close(dual.update(violation)["coef_loss"], loss.detach())
+    th.testing.assert_close(dual.value, of(start).detach().view(shape))
+    assert dual.value.shape == shape
+
+
+@pytest.mark.parametrize("kind", [SoftplusDual, DualVariable])
+def test_one_coefficient_a_dimension_follows_its_own_constraint(kind):
+    dual = kind("coef", 1.0, (0.9, 1.1), 0.2, CPU, (2,))
+    for _ in range(5):
+        dual.update(th.tensor([[1.0, -1.0], [3.0, -0.5]]))
+    assert dual.value.tolist() == pytest.approx([1.1, 0.9])
+    assert dual.at_bound().item() == 1
+    dual = kind("coef", 1.0, (0.9, 1.1), 0.2, CPU, (2,))
+    for _ in range(5):
+        dual.update(th.tensor([1.0, 0.0]))
+    assert dual.value.tolist() == pytest.approx([1.1, 1.0])
+    assert dual.at_bound().item() == 0.5
+
+
+@pytest.mark.parametrize("shape", [(), (3,)])
+def test_padding_moves_no_coefficient(shape):
+    """Not even where it is no number."""
+    violation, mask = th.randn(4, 2, *shape), th.ones(4, 2)
+    violation[2:, 1] = float("nan")
+    mask[2:, 1] = 0
+    padded, valid = (SoftplusDual("coef", 1.0, (0.1, 10.0), 0.1, CPU, shape) for _ in range(2))
+    losses = padded.update(violation, mask), valid.update(violation[mask > 0])
+    th.testing.assert_close(*losses)
+    th.testing.assert_close(padded.optimizer.state_dict()["state"], valid.optimizer.state_dict()["state"])
+
+
+def test_a_coefficient_that_is_moved_by_steps_stays_inside_its_bounds_and_says_where_it_is():
+    coefficient = AdditiveCoefficient(0.5, 0.2, (0.0, 1.0), CPU)
+    seen = []
+    for direction in (1.0, -1.0, 0.0, -1.0, -1.0, -1.0, 4.0, 1.0):
+        coefficient.move(direction)
+        seen.append((coefficient.value.item(), coefficient.at_bound().item()))
+    values = [0.7, 0.5, 0.5, 0.3, 0.1, 0.0, 0.8, 1.0]
+    assert [value for value, _ in seen] == pytest.approx(values)
+    assert [at_bound for _, at_bound in seen] == [value in (0.0, 1.0) for value in values]
+    assert coefficient.update(th.ones(3)) == {}
+    assert coefficient.value.item() == 1.0
