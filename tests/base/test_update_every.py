@@ -23,12 +23,12 @@ def _state(model, name):
 def _moved(model, rounds):
     """Name -> the gradient steps in which it moved, of rounds of so many each."""
     names, moved, done = list(model.policy.trained), {}, 0
-    one_update = model._one_update
+    update = model.update
 
-    def watched(batch_size):
+    def watched(batch):
         nonlocal done
         before = {name: _state(model, name) for name in names}
-        metrics = one_update(batch_size)
+        metrics = update(batch)
         for name in names:
             (parameters, steps), (parameters_now, steps_now) = before[name], _state(model, name)
             changed = any(not th.equal(p, q) for p, q in zip(parameters, parameters_now, strict=True))
@@ -38,7 +38,7 @@ def _moved(model, rounds):
         done += 1
         return metrics
 
-    model._one_update = watched
+    model.update = watched
     for gradient_steps in rounds:
         model.train(gradient_steps, 8)
     return moved
@@ -70,8 +70,8 @@ def test_by_name_and_for_all_critics(update_every, expected):
 
 def test_the_norm_that_is_logged_is_the_mean_of_the_steps_that_were_taken():
     model, norms = _model(policy_delay=2), []
-    one_update = model._one_update
-    model._one_update = lambda batch_size: norms.append(one_update(batch_size)) or norms[-1]
+    update = model.update
+    model.update = lambda batch: norms.append(update(batch)) or norms[-1]
     model.train(4, 8)
     own = [metrics["learner_grad_norm"].item() for metrics in norms if "learner_grad_norm" in metrics]
     assert len(own) == 2
@@ -108,6 +108,7 @@ def compiled(monkeypatch):
 def test_a_step_with_networks_that_rest_is_a_program_of_its_own(compiled):
     compiled.train(4, 8)
     assert len(compiled.programs) == 2
+    compiled.programs.clear()  # of what is watched they are made anew
     assert _moved(compiled, (4,))["actor"] == [0, 2]
 
 
