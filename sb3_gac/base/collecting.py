@@ -272,4 +272,5 @@ class DataCollection(OffPolicyAlgorithm):
         self._last_obs, self._last_original_obs, self._last_episode_starts = new_obs, following, np.array(dones)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_replay_source", "_last_use"]
+        of_the_data = ["_rollout_steps", "_rollout_episodes"]  # steps that a file of the model leaves behind
+        return [*super()._excluded_save_params(), "_replay_source", "_last_use", *of_the_data]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.config import resolve
-from benchmarks.run import environment
+from benchmarks.environments import environment
 from benchmarks.suite import read_suite
 
 SPECS = read_suite(Path(__file__).parents[2] / "benchmarks" / "suites" / "memory.yml")

@@ -49,6 +49,16 @@ SHARED = {
         [{"student": ["partial"]}, {"critic": ["touch"]}, {"critic": []}, {"critic": "partial"}, 3, "partial"],
         r'role_keys( names unknown roles|\["\w*critic"\] (names unknown.*touch|must be a non-empty list)| must be a dict)',
     ),
+    "policy_delay": ([0, -1, 1.5, None], "policy_delay must be an integer >= 1"),
+    "update_every": (
+        [2, "critic", {"nobody": 2}, {"critic": 0}, {"critic": 1.5}],
+        r'update_every( must be a dict|\["critic"\] must be an integer >= 1| names unknown roles \[.nobody.\])',
+    ),
+    "behaviour": (
+        [0.5, "critic", {"nobody": 0.5}, {"POLICY": 1.5}],
+        "behaviour(: a policy must be one of| must be a policy's name, a dict of shares or None| must be shares from 0 to 1)",
+    ),
+    "behaviour_per": (["step", 2, None], r"behaviour_per must be one of \['environment', 'episode'\]"),
     "compile": (["yes", 2, None], r"compile must be one of \[False, True\]"),
     "mixed_precision": (["bfloat16", 2, None], r"mixed_precision must be one of \[False, True\]"),
     "stats_window_size": ([0, -1, 1.5, None], "stats_window_size must be an integer >= 1"),
@@ -102,6 +112,8 @@ CASES = [
 
 @pytest.mark.parametrize(("cls", "name", "value", "message"), CASES)
 def test_an_argument_out_of_its_range_is_named(cls, name, value, message):
+    if value == {"POLICY": 1.5}:
+        value = {cls.policy_aliases["MultiInputPolicy"].roles.deployed: 1.5}
     arguments = {"policy": "MultiInputPolicy", "env": TwoViewBandit(), "buffer_size": 100, name: value}
     with pytest.raises(ValueError, match=message):
         cls(**arguments)

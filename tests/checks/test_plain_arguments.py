@@ -93,6 +93,8 @@ SHARED = {
     "target_entropy": np.float32(-1.0),
     "max_grad_norm": np.array([0.5]),
     "lr_scales": {"critic": np.array([3.0])},
+    "policy_delay": np.int64(1),
+    "update_every": {"critic": np.int64(1)},
     "compile": np.bool_(False),
     "mixed_precision": np.bool_(False),
     "optimize_memory_usage": np.bool_(False),
@@ -109,6 +111,7 @@ SHARED = {
 }
 GACS_OWN = {
     "target_kl": np.float64(0.01),
+    "behaviour": {"learner": np.float32(0.25)},
     "kl_coef_bounds": np.array([1e-3, 10.0]),
     "kl_coef_learning_rate": np.float64(1e-2),
     "max_kl": np.float32(0.5),
@@ -138,7 +141,7 @@ def test_a_model_made_with_foreign_numbers_is_saved_loaded_and_resumed(cls, tmp_
 
 def test_every_argument_that_can_hold_a_number_is_tried():
     others = {"policy", "env", "action_noise", "replay_buffer_class", "role_keys", "kl_coef", "kl_reduction", "guider"}
-    others |= {"shared_std", "tensorboard_log", "device", "_init_setup_model"}
+    others |= {"shared_std", "tensorboard_log", "device", "_init_setup_model", "behaviour_per"}
     assert set(inspect.signature(GAC).parameters) == {*SHARED, *GACS_OWN, *others}
 
 
