@@ -188,7 +188,6 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         )
         if self.compile:
             self._check_can_compile(side_effects)
-        self._update_every = resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
         self.chooses_behaviour = self._make_behaviour()
         self.coefficients = self.make_coefficients()
         self._keep_coefficients()

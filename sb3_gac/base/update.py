@@ -2,6 +2,7 @@
 
 import warnings
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -13,6 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.base.faults import FaultTolerance
 from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.base.roles import resolve_update_every
 from sb3_gac.checks.divergence import check_finite_metrics
 from sb3_gac.math.losses import critic_loss, masked_mean, soft_target
 from sb3_gac.networks.actors import RolePolicy
@@ -60,37 +62,17 @@ class Batch(NamedTuple):
         both: Any = policy.distribution(self.sequence)  # type: ignore[arg-type]
         return Outputs(type(both)(*(part[:-1] for part in both)), type(both)(*(part[1:].detach() for part in both)))
 
-    def soft_target(
-        self,
-        next_q: th.Tensor,
-        *,
-        log_prob: th.Tensor | float = 0.0,
-        ent_coef: th.Tensor | float = 0.0,
-        kl: th.Tensor | float = 0.0,
-        kl_coef: th.Tensor | float = 0.0,
-        reward: th.Tensor | None = None,
-    ) -> th.Tensor:
+    def soft_target(self, next_q: th.Tensor, reward: th.Tensor | None = None, **terms: th.Tensor | float) -> th.Tensor:
         r"""
-        The Bellman target of these transitions, see :func:`sb3_gac.math.losses.soft_target`.
+        The Bellman target of these transitions.
 
         :param next_q: target critics at the next observations, shape (N, \*E)
-        :param log_prob: of the next actions, shape (\*E)
-        :param ent_coef: its weight
-        :param kl: at the next observations, shape (\*E)
-        :param kl_coef: its weight
         :param reward: in place of the batch's, shape (\*E)
+        :param terms: of :func:`sb3_gac.math.losses.soft_target`: entropy and KL at the next observations, and their weights
         :return: shape (\*E)
         """
-        return soft_target(
-            reward=self.rewards if reward is None else reward,
-            done=self.dones,
-            next_q=next_q,
-            discount=self.discounts,
-            next_log_prob=log_prob,
-            ent_coef=ent_coef,
-            next_kl=kl,
-            kl_coef=kl_coef,
-        )
+        reward = self.rewards if reward is None else reward
+        return soft_target(reward=reward, done=self.dones, next_q=next_q, discount=self.discounts, **terms)
 
     @th.no_grad()
     def q_at_obs(self, critic: Any) -> Callable[[Any], th.Tensor]:
@@ -165,7 +147,8 @@ class NetworkTraining(FaultTolerance):
     max_grad_norm: float | None
     compile: bool
     mixed_precision: bool
-    _update_every: Mapping[str, int]
+    policy_delay: int
+    update_every: Mapping[str, int] | None
     programs: dict[Any, Program]
     _branches_are_independent: bool
     _at_once = False
@@ -296,11 +279,12 @@ class NetworkTraining(FaultTolerance):
         self._at_once = self._branches_are_independent and th.get_num_threads() > 1
         settings = (getattr(self, name) for name in self.compiled_settings)
         self._program_key = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
+        update_every = resolve_update_every(self.policy.roles, self.policy_delay, self.update_every)
         history: list[Metrics] = []
         with halved_threads(self._at_once):
             for _ in range(gradient_steps):
                 batch = self._sample_batch(batch_size)
-                self._resting = frozenset(name for name, every in self._update_every.items() if self._n_updates % every)
+                self._resting = frozenset(name for name, every in update_every.items() if self._n_updates % every)
                 whole = self.compile and not self._in_several_programs
                 history.append(self._compiled("update", self.update, batch) if whole else self.update(batch))
                 self._n_updates += 1
@@ -389,9 +373,10 @@ class NetworkTraining(FaultTolerance):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if not history:
             return
-        names = list(dict.fromkeys(name for step in history for name in step))  # a resting network leaves some out
-        means = [th.stack([step[name] for step in history if name in step]).mean() for name in names]
-        values = dict(zip(names, th.stack(means).tolist(), strict=True))
+        counts = Counter(name for step in history for name in step)  # a resting network leaves some out
+        nothing = th.zeros((), device=self.device)
+        sums = th.stack([th.stack([step.get(name, nothing) for name in counts]) for step in history]).sum(dim=0).tolist()
+        values = {name: total / count for (name, count), total in zip(counts.items(), sums, strict=True)}
         values["actor_loss"] = values[f"{self.policy.roles.deployed}_loss"]  # SB3's names for the two
         values["critic_loss"] = sum(value for name, value in values.items() if name.endswith("critic_loss"))
         for name, value in values.items():

@@ -65,7 +65,7 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         """The actor's return, with its entropy."""
         with th.no_grad():
             next_q, log_prob = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
-            target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta)
+            target = batch.soft_target(next_q, next_log_prob=log_prob, ent_coef=beta)
         return self.bellman_loss("critic", batch, target)
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:

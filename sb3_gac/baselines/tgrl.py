@@ -132,7 +132,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
         """Q_R: the main actor's return, with its entropy; both actors climb it."""
         with th.no_grad():
             next_q, log_prob = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.reward_critic_target), noise)
-            target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta)
+            target = batch.soft_target(next_q, next_log_prob=log_prob, ent_coef=beta)
         return self.bellman_loss("reward_critic", batch, target)
 
     def teacher_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor) -> Loss:
@@ -140,7 +140,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
         with th.no_grad():
             next_q, _ = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.teacher_critic_target), noise)
             kl = actor.later.kl(self.frozen["teacher"](batch.next_observations))
-            target = batch.soft_target(next_q, reward=th.zeros_like(batch.rewards), kl=kl, kl_coef=1.0)
+            target = batch.soft_target(next_q, reward=th.zeros_like(batch.rewards), next_kl=kl, kl_coef=1.0)
         return self.bellman_loss("teacher_critic", batch, target)
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor, c: th.Tensor) -> Loss:

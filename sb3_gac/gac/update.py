@@ -65,7 +65,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
             later = self.policy.action_distributions(guider.later, learner.later)
             next_q, log_prob = later.guider.value_and_log_prob(batch.q_at_next_obs(self.policy.guider_critic_target), noise)
             kl = later.guider.kl_of_means(later.learner, self.kl_reduction)
-            target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta, kl=kl, kl_coef=alpha)
+            target = batch.soft_target(next_q, next_log_prob=log_prob, ent_coef=beta, next_kl=kl, kl_coef=alpha)
         return self.bellman_loss("guider_critic", batch, target)
 
     def guider_loss(
@@ -94,7 +94,7 @@ class GuidedUpdate(AsymmetricOffPolicyAlgorithm):
         with th.no_grad():
             policy = self.policy.action_distributions(guider.later, learner.later).learner
             next_q, log_prob = policy.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
-            target = batch.soft_target(next_q, log_prob=log_prob, ent_coef=beta * self.learner_entropy)
+            target = batch.soft_target(next_q, next_log_prob=log_prob, ent_coef=beta * self.learner_entropy)
         return self.bellman_loss("learner_critic", batch, target)
 
     def learner_loss(

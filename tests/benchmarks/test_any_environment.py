@@ -18,6 +18,7 @@ from benchmarks.finished import kind_of, name_of
 from benchmarks.launch import jobs_left
 from benchmarks.run import run
 from benchmarks.suite import read_suite
+from tests.benchmarks.helpers import SMALL_SUITE
 
 MODULE = '''
 import gymnasium as gym
@@ -57,14 +58,6 @@ gym.register("Line-v0", entry_point=Line)
 SPLIT = {"sb3_gac.envs:SplitObservation": {"partial": [0], "privileged": [0, 1]}}
 CELL = {"env": "MODULE:Line-v0", "algorithms": ["gac"], "seeds": [0]}
 OWN = CELL | {"env_kwargs": {"difficulty": 3}, "wrappers": [SPLIT, "MODULE:Doubled"], "name": "my-line"}
-SUITE = {
-    "steps": 60,
-    "envs": 2,
-    "preset": "small",
-    "eval_every": 20,
-    "eval_episodes": 1,
-    "overrides": {"learning_starts": 20, "batch_size": 4, "gradient_steps": 1, "policy_kwargs": {"net_arch": [4]}},
-}
 
 
 @pytest.fixture
@@ -75,7 +68,7 @@ def suite(tmp_path, monkeypatch):
     (tmp_path / f"{name}.py").write_text(MODULE)
 
     def write(*cells, **changes):
-        text = yaml.safe_dump({**SUITE, "cells": list(cells), **changes}).replace("MODULE", name)
+        text = yaml.safe_dump({**SMALL_SUITE, "cells": list(cells), **changes}).replace("MODULE", name)
         (tmp_path / "own.yml").write_text(text)
         return tmp_path / "own.yml"
 

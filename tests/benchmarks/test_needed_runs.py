@@ -20,6 +20,7 @@ from benchmarks.launch import Job, count, jobs_left, launch, run_command
 from benchmarks.run import run
 from benchmarks.suite import RunSpec, needed_runs, needed_steps, read_suite
 from sb3_gac import AsymmetricSAC
+from tests.benchmarks.helpers import SMALL_SUITE
 
 
 class Taught(AsymmetricSAC):
@@ -46,15 +47,7 @@ OWN = {
     "bereft": {"class": f"{__name__}:Taught", "needs": {"teacher": {"algorithm": "failing"}}},
     "orphaned": {"class": f"{__name__}:Taught", "needs": {"teacher": {"algorithm": "bereft"}}},
 }
-SUITE = {
-    "steps": 60,
-    "envs": 2,
-    "preset": "small",
-    "eval_every": 20,
-    "eval_episodes": 1,
-    "overrides": {"learning_starts": 20, "batch_size": 4, "gradient_steps": 1, "policy_kwargs": {"net_arch": [4]}},
-    "algorithms": OWN,
-}
+SUITE = SMALL_SUITE | {"algorithms": OWN}
 CELL = {"task": "Pendulum", "noises": [0.1], "algorithms": ["taught"], "seeds": [0]}
 
 
