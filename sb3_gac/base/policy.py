@@ -262,10 +262,14 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
             network.optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
             self.trained[role] = TrainedParameters(own, network.optimizer, self.unclipped(role))
 
-    def refresh_parameters(self) -> None:
-        """To be called before training and before saving: parameters may have been frozen, see :class:`TrainedParameters`."""
+    def refresh_parameters(self, compiled: bool | None = None) -> None:
+        """
+        To be called before training and before saving: parameters may have been frozen, see :class:`TrainedParameters`.
+
+        :param compiled: see :meth:`TrainedParameters.refresh`
+        """
         for parameters in self.trained.values():
-            parameters.refresh()
+            parameters.refresh(compiled)
 
     @property
     def optimizer_options(self) -> tuple[Any, ...]:

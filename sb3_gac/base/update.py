@@ -274,7 +274,7 @@ class NetworkTraining(FaultTolerance):
             return
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._scheduled_optimizers())
-        self.policy.refresh_parameters()
+        self.policy.refresh_parameters(self.compile)
         self.refresh_schedules()
         self._at_once = self._branches_are_independent and th.get_num_threads() > 1
         settings = (getattr(self, name) for name in self.compiled_settings)
@@ -350,7 +350,7 @@ class NetworkTraining(FaultTolerance):
     def refresh_schedules(self) -> None:
         """Before a round of gradient steps: put in tensors what schedules say now."""
         for coefficient in self.coefficients.values():
-            coefficient.refresh()
+            coefficient.refresh(self.compile)
 
     @abstractmethod
     def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:

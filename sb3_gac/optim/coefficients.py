@@ -30,7 +30,7 @@ class FixedCoefficient:
     def __init__(self, value: float, device: th.device):
         self.value = th.tensor(float(value), device=device)
 
-    def refresh(self) -> None:
+    def refresh(self, compiled: bool | None = None) -> None:
         """To be called before training: a file's state may have been loaded."""
 
     def update(self, violation: th.Tensor, mask: th.Tensor | None = None) -> dict[str, th.Tensor]:
@@ -125,9 +125,13 @@ class SoftplusDual:
         """The coefficients, detached, of the shape that was asked for."""
         return self._value_and_slope(self.parameter.detach())[0].view(self.shape)
 
-    def refresh(self) -> None:
-        """To be called before training: a file's state may have been loaded, or the learning rate set."""
-        self._trained.refresh()
+    def refresh(self, compiled: bool | None = None) -> None:
+        """
+        To be called before training: a file's state may have been loaded, or the learning rate set.
+
+        :param compiled: see :meth:`TrainedParameters.refresh`
+        """
+        self._trained.refresh(compiled)
 
     def go_on_from(self, other: "Coefficient") -> None:
         """

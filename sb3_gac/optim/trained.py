@@ -21,6 +21,8 @@ class AdamTensors(NamedTuple):
     :param exp_avg_sqs: running mean of its square
     :param steps: taken so far, of each one, scalars
     :param learning_rate: scalar
+    :param powers: beta1 and beta2 to the number of steps, of each parameter, scalars: for compiled steps, which would
+        compute a power for each number of a parameter
     """
 
     parameters: list[th.Tensor]
@@ -28,6 +30,15 @@ class AdamTensors(NamedTuple):
     exp_avg_sqs: list[th.Tensor]
     steps: list[th.Tensor]
     learning_rate: th.Tensor
+    powers: tuple[list[th.Tensor], list[th.Tensor]]
+
+    def bring_up_powers(self, betas: tuple[float, float]) -> None:
+        """
+        :param betas: of the optimiser
+        """
+        for beta, powers in zip(betas, self.powers, strict=True):
+            for power, step in zip(powers, self.steps, strict=True):
+                power.copy_(beta**step)
 
 
 class TrainedParameters:
@@ -47,6 +58,7 @@ class TrainedParameters:
         self._clips = [index < len(self.everything) - unclipped for index in range(len(self.everything))]
         self._state: object = None
         self.trained: list[bool] = []
+        self._powers_follow = True
         self.refresh()
 
     @property
@@ -54,8 +66,12 @@ class TrainedParameters:
         """Whether :meth:`step` is made of tensor operations alone."""
         return self.adam is not None
 
-    def refresh(self) -> None:
-        """To be called before training and before saving: parameters may have been frozen, and a file's state loaded."""
+    def refresh(self, compiled: bool | None = None) -> None:
+        """
+        To be called before training and before saving: parameters may have been frozen, and a file's state loaded.
+
+        :param compiled: whether the steps to come are; ``None`` if none follow
+        """
         trained = [parameter.requires_grad for parameter in self.everything]
         group = self.optimizer.param_groups[0]
         if trained != self.trained or self.optimizer.state is not self._state:
@@ -69,6 +85,9 @@ class TrainedParameters:
             self.adam = self._gathered() if _is_plain_adam(self.optimizer) else None
         if self.adam is not None:
             self.adam.learning_rate.fill_(group["lr"])
+            if compiled and not self._powers_follow:
+                self.adam.bring_up_powers(group["betas"])
+            self._powers_follow = self._powers_follow if compiled is None else compiled
         group["trained"] = trained
 
     def _gathered(self) -> AdamTensors:
@@ -80,7 +99,10 @@ class TrainedParameters:
         states = [self.optimizer.state[parameter] for parameter in self.parameters]
         means, squares, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
         learning_rate = th.zeros((), device=self.everything[0].device if self.everything else None)
-        return AdamTensors(list(self.parameters), means, squares, steps, learning_rate)
+        powers = [step.clone() for step in steps], [step.clone() for step in steps]
+        adam = AdamTensors(list(self.parameters), means, squares, steps, learning_rate, powers)
+        adam.bring_up_powers(self.optimizer.param_groups[0]["betas"])
+        return adam
 
     def freeze_as_saved(self) -> None:
         """Freeze and unfreeze the parameters as they were when the optimiser's state was saved."""
@@ -176,13 +198,15 @@ def adam_step(adam: AdamTensors, gradients: Sequence[th.Tensor], options: dict) 
             maximize=False,
         )
         return
-    moments = zip(adam.parameters, gradients, adam.exp_avgs, adam.exp_avg_sqs, adam.steps, strict=True)
-    for parameter, gradient, mean, square, step in moments:
+    moments = zip(adam.parameters, gradients, adam.exp_avgs, adam.exp_avg_sqs, *adam.powers, strict=True)
+    for parameter, gradient, mean, square, power1, power2 in moments:
+        power1.mul_(beta1)
+        power2.mul_(beta2)
         if decoupled:
             parameter.mul_(1 - adam.learning_rate * weight_decay)
         elif weight_decay:
             gradient = gradient + weight_decay * parameter
         mean.lerp_(gradient, 1 - beta1)
         square.lerp_(gradient.square(), 1 - beta2)
-        spread = (square / (1 - beta2**step)).sqrt() + eps
-        parameter.sub_(adam.learning_rate * mean / (1 - beta1**step) / spread)
+        spread = (square / (1 - power2)).sqrt() + eps
+        parameter.sub_(adam.learning_rate * mean / (1 - power1) / spread)

@@ -161,3 +161,11 @@ def test_each_program_has_code_of_its_own(monkeypatch):
     x = th.rand(3)
     for program, function in zip(programs, (th.sin, th.cos, th.sin), strict=True):
         assert th.equal(program(x), function(x))
+
+
+def test_steps_that_are_compiled_go_on_from_plain_ones_and_the_reverse():
+    plain, switched = _filled(AsymmetricSAC), _filled(AsymmetricSAC)
+    for compiled in (False, True, False, True):
+        switched.compile = compiled
+        _train((plain, switched), gradient_steps=2)
+    _assert_equal(plain, switched, rtol=1e-4, atol=1e-6)
