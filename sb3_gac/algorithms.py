@@ -10,6 +10,8 @@ ALGORITHMS = {
     "gac_without_q": "sb3_gac.gac.ablations:GACWithoutQ",
     "asymmetric_sac": "sb3_gac.baselines.asymmetric_sac:AsymmetricSAC",
     "tgrl": "sb3_gac.baselines.tgrl:TGRL",
+    "gpo_clip": "sb3_gac.baselines.gpo:GPO",
+    "gpo_penalty": "sb3_gac.baselines.gpo:GPOPenalty",
 }
 _NAMES = {path: name for name, path in ALGORITHMS.items()}
 

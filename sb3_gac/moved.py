@@ -47,6 +47,7 @@ MOVED = {
         "envs.popgym": "envs.suites.popgym",
         "export": "deploy.export",
         "gac.presets": "presets",
+        "gac.update": "gac.gac",
         "verification": "deploy.verification",
     }.items()
 }

@@ -70,27 +70,66 @@ class OffPolicyArguments(PositionalArguments, total=False):
     _init_setup_model: Annotated[bool, True]
 
 
-def _shared_parameters() -> list[Parameter]:
+class PositionalOnPolicyArguments(TypedDict, total=False):
+    """What SB3's PPO takes after ``policy`` and ``env``, in its order, as far as others have it: each a type and a default."""
+
+    learning_rate: Annotated[float | Schedule, 3e-4]
+    n_steps: Annotated[int, 2048]
+    batch_size: Annotated[int, 64]
+    n_epochs: Annotated[int, 10]
+    gamma: Annotated[float, 0.99]
+    gae_lambda: Annotated[float, 0.95]
+    clip_range: Annotated[float | Schedule, 0.3]
+    normalize_advantage: Annotated[bool, True]
+    ent_coef: Annotated[float, 0.0]
+    vf_coef: Annotated[float, 0.25]
+
+
+class OnPolicyArguments(PositionalOnPolicyArguments, total=False):
+    """All that on-policy algorithms share but ``policy`` and ``env``, described by ``AsymmetricOnPolicyAlgorithm``."""
+
+    max_grad_norm: Annotated[float | None, 1.0]
+    reward_scale: Annotated[float, 1.0]
+    unroll_length: Annotated[int | None, None]
+    lr_scales: Annotated[Mapping[str, float] | None, None]
+    role_keys: Annotated[RoleKeys | None, None]
+    compile: Annotated[bool, False]
+    mixed_precision: Annotated[bool, False]
+    stats_window_size: Annotated[int, 100]
+    tensorboard_log: Annotated[str | None, None]
+    policy_kwargs: Annotated[dict[str, Any] | None, None]
+    verbose: Annotated[int, 0]
+    seed: Annotated[int | None, None]
+    device: Annotated[th.device | str, "auto"]
+    _init_setup_model: Annotated[bool, True]
+
+
+def _signature(shared: type, positional: type) -> inspect.Signature:
+    by_position = positional.__annotations__
     parameters = []
-    for name, hint in get_type_hints(OffPolicyArguments, include_extras=True).items():
-        by_position = name in PositionalArguments.__annotations__
-        kind = Parameter.POSITIONAL_OR_KEYWORD if by_position else Parameter.KEYWORD_ONLY
+    for name, hint in get_type_hints(shared, include_extras=True).items():
+        kind = Parameter.POSITIONAL_OR_KEYWORD if name in by_position else Parameter.KEYWORD_ONLY
         annotation, default = get_args(hint)
         parameters.append(Parameter(name, kind, default=default, annotation=annotation))
-    return parameters
+    return inspect.Signature(parameters)
 
 
-SHARED = inspect.Signature(_shared_parameters())
+#: Table of shared arguments -> signature
+SHARED: dict[type, inspect.Signature] = {
+    OffPolicyArguments: _signature(OffPolicyArguments, PositionalArguments),
+    OnPolicyArguments: _signature(OnPolicyArguments, PositionalOnPolicyArguments),
+}
 
 
-def with_defaults(by_position: Sequence[Any], by_name: Mapping[str, Any]) -> dict[str, Any]:
+def with_defaults(shared: type, by_position: Sequence[Any], by_name: Mapping[str, Any]) -> dict[str, Any]:
     """
-    :param by_position: values of the first shared arguments
+    :param shared: table of arguments, a key of ``SHARED``
+    :param by_position: values of the first ones
     :param by_name: others
-    :return: name -> value of each shared argument
+    :return: name -> value of each
     :raises TypeError: Python's own, if there are too many or one is given twice
     """
-    bound = SHARED.bind(*by_position, **by_name)
+    bound = SHARED[shared].bind(*by_position, **by_name)
     bound.apply_defaults()
     return bound.arguments
 
@@ -107,7 +146,8 @@ class ConstructorArguments:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if not hasattr(cls.__init__, "__signature__"):  # its own, or that of a mixin
+        has_constructor = any("__init__" in vars(kind) for kind in cls.__mro__ if _is_ours(kind))
+        if has_constructor and not hasattr(cls.__init__, "__signature__"):  # its own, or that of a mixin
             type.__setattr__(cls, "__init__", _prepared(cls.__init__, inspect.Signature(_constructor_parameters(cls.__mro__))))
         for former, present in merged(cls, "renamed_arguments").items():
             setattr(cls, former, _former_attribute(former, present))
@@ -130,8 +170,9 @@ def _constructor_parameters(mro: Sequence[type]) -> list[Parameter]:
     if Parameter.VAR_KEYWORD not in variable or not others:
         return [*positional, *by_name]
     handed_on = _constructor_parameters(others)
-    if get_args(variable[Parameter.VAR_KEYWORD]) == (OffPolicyArguments,) and not any(map(_is_ours, others)):
-        handed_on = list(SHARED.parameters.values())
+    (shared,) = get_args(variable[Parameter.VAR_KEYWORD]) or (None,)
+    if shared in SHARED and not any("__init__" in vars(other) for other in others if _is_ours(other)):
+        handed_on = list(SHARED[shared].parameters.values())
     named_before, named_behind = ({each.name for each in group} for group in (positional, by_name))
     by_position = Parameter.VAR_POSITIONAL in variable
     for each in handed_on:

@@ -1,7 +1,9 @@
 """Collecting data: every step that was taken is stored and none is invented, whoever stops, interrupts or interferes."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +15,19 @@ from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, TrainFr
 from stable_baselines3.common.utils import should_collect_more_steps
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
-from typing_extensions import Self
 
-from sb3_gac.checks.environments import EnvironmentGuard, guard_environments, guard_of
-from sb3_gac.checks.requirements import check_environment
+from sb3_gac.base.faults import check_same_spaces_as
+from sb3_gac.checkpoint.rows import SavedBlocks, read_rows, write_rows
+from sb3_gac.checks.arguments import check_train_freq
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.source import ReplaySource
+
+#: Options of our replay buffers that say how to sample, not what is stored
+SAMPLING_OPTIONS = ("n_steps", "gamma", "sequence_length", "burn_in")
+
+
+class OtherNumberOfEnvironmentsError(AssertionError, ValueError):
+    """The replay buffer was filled by as many environments as the model does not have. SB3 raises AssertionError here."""
 
 
 class DataCollection(OffPolicyAlgorithm):
@@ -30,43 +39,22 @@ class DataCollection(OffPolicyAlgorithm):
     they do what one would have done.
     """
 
+    #: Attributes that collecting changes
+    collected = ("_episode_num", "_rollout_steps", "_rollout_episodes", "_last_original_obs")
     #: Steps of each environment, and episodes, of the rollout under way
     _rollout_steps = 0
     _rollout_episodes = 0
-    #: Guard of the environments that were last used from here, and what it had counted by then
-    _last_use: tuple[EnvironmentGuard | None, int] = (None, 0)
     _replay_source: ReplaySource | None = None
-    _used_elsewhere_said = False
-    #: Of each environment: role of the policy that acts, return of the episode so far, whether actions in it were uniform
-    acting: Sequence[str] = ()
-    _returns_so_far: Any = None
-    _has_warmed_up: Any = None
-
-    # --- hooks, for algorithms -----------------------------------------------------------------------------------------
-
-    def on_step(self) -> None:
-        """After each step of the environments, once it is stored."""
-
-    def on_episode_end(self, env: int, episode_return: float, role: str | None) -> None:
-        """
-        After an episode's last step, once it is stored and before :meth:`on_step`.
-
-        :param env: number of the environment
-        :param episode_return: sum of the rewards as they are stored, that is, before normalisation
-        :param role: of the policy that has acted; ``None`` if actions of the warm-up were among its own
-        """
-
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """
-        Whatever environment the model is given comes through here.
-
-        :raises ValueError: see :func:`check_environment`
-        """
-        check_environment(env)
-        wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        guard_environments(wrapped)
-        return wrapped
+    _saved_blocks: SavedBlocks | None = None
+    _resumed_noise: Any = None
+    _returns_so_far: Any
+    _behaviour_state: Any
+    _make_replay_buffer: Callable[[], ReplayBuffer]
+    _replay_buffer_options: Callable[[], dict[str, Any]]
+    _fit_action_noise: Callable[[], None]
+    note_use: Callable[[], None]
+    call_hooks: Callable[[np.ndarray], None]
+    reset_if_used_elsewhere: Callable[[VecEnv], None]
 
     @property
     def replay_source(self) -> ReplaySource:
@@ -114,31 +102,94 @@ class DataCollection(OffPolicyAlgorithm):
             )
         buffer.holds_normalised = normalised  # type: ignore[attr-defined]
 
+    # --- other environments -----------------------------------------------------------------------------------------
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        See SB3's ``set_env``; as long as nothing is in the replay buffer, the number of environments may be another one.
+
+        :raises ValueError: if the replay buffer was filled by another number of environments
+        """
+        assert isinstance(env, VecEnv)
+        buffer = self.replay_buffer
+        if buffer is not None and buffer.n_envs != env.num_envs:
+            if buffer.size() > 0:
+                _check_number(buffer, env.num_envs, f"{type(self).__name__}.load(path, env=...) takes any number")
+            self.replay_buffer = None
+        if env.num_envs != self.n_envs:
+            check_train_freq("train_freq", self.train_freq, env.num_envs)
+            self.n_envs, self._last_obs, self._behaviour_state = env.num_envs, None, None
+            self._fit_action_noise()
+        super().set_env(env, force_reset)
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
+        if isinstance(self.replay_buffer, HerReplayBuffer):
+            self.replay_buffer.env = self.env  # which rewards goals: SB3 would ask the one before
+        _ = self.replay_source  # which may refuse, or warn
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """
+        See SB3's ``load_replay_buffer``; how the buffer is sampled is the model's to say, not the file's.
+
+        :raises ValueError: naming the observation entries whose spaces are not the model's, or if another number of
+            environments filled it; the buffer stays what it was
+        """
+        before = self.replay_buffer
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+        finally:
+            loaded, self.replay_buffer = self.replay_buffer, before
+        assert loaded is not None
+        check_same_spaces_as(self, loaded, "replay buffer")
+        if self.env is not None:
+            _check_number(loaded, self.n_envs)
+        self.replay_buffer = loaded
+        if isinstance(loaded, CompactDictReplayBuffer):
+            options = self._replay_buffer_options()
+            given = {name: options[name] for name in SAMPLING_OPTIONS if name in options and hasattr(loaded, name)}
+            vars(loaded).update(given)
+
+    # --- checkpoints ------------------------------------------------------------------------------------------------
+
+    def save_data(self, root: Path) -> tuple[dict[str, Any], list[str]]:
+        """Of the replay buffer, only what has changed is written."""
+        buffer = self.replay_buffer
+        if buffer is None:
+            raise TypeError("There is no replay buffer to write down: set_env() gives one to a model that was loaded without.")
+        if not isinstance(buffer, CompactDictReplayBuffer):
+            raise TypeError(
+                f"A checkpoint can hold a CompactDictReplayBuffer or a subclass, but replay_buffer_class is "
+                f"{type(buffer).__name__}: leave it out, or use save() and save_replay_buffer()."
+            )
+        self._saved_blocks = write_rows(buffer, root, self._saved_blocks)
+        return buffer.bookkeeping() | {"blocks": self._saved_blocks.names}, self._saved_blocks.names
+
+    def restore_data(self, root: Path, saved: dict[str, Any]) -> None:
+        """The replay buffer as it was, and the action noise, which SB3 resets at each ``learn``."""
+        buffer = self.replay_buffer
+        assert isinstance(buffer, CompactDictReplayBuffer)
+        names = saved.pop("blocks")
+        buffer.restore_bookkeeping(saved)
+        self._saved_blocks = read_rows(buffer, root, names)
+        self._resumed_noise = self.action_noise
+
     # --- episodes ---------------------------------------------------------------------------------------------------
 
-    def learn(self, *args: Any, **kwargs: Any) -> Self:
-        """See SB3's ``learn``. After an interrupt, as by Ctrl-C, the next one starts with a reset of the environments."""
-        try:
-            return super().learn(*args, **kwargs)
-        except BaseException as error:
-            if not isinstance(error, Exception):
-                self._last_obs = None
-            raise
-
-    def _setup_learn(
-        self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
-    ) -> Any:
-        resets = reset_num_timesteps or self._last_obs is None
-        if resets:
-            self._cut_episodes()
+    def _setup_learn(self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any) -> Any:
+        """A resumed action noise goes on."""
+        if self.replay_buffer is None and self.env is not None:
+            self.replay_buffer = self._make_replay_buffer()
+        if self.replay_buffer is not None:
+            _check_number(self.replay_buffer, self.n_envs)
         if reset_num_timesteps:
             self._rollout_steps, self._rollout_episodes = 0, 0
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
-        if resets:
-            self._note_reset()
+        noise, self._resumed_noise = deepcopy(self._resumed_noise), None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
+        if noise is not None and not reset_num_timesteps:
+            self.action_noise = noise
         return result
 
-    def _cut_episodes(self) -> None:
+    def cut_episodes(self) -> None:
         """The environments are about to be reset: what was stored last is not continued by what comes next."""
         if isinstance(self.replay_buffer, CompactDictReplayBuffer):
             self.replay_buffer.mark_reset()
@@ -147,41 +198,10 @@ class DataCollection(OffPolicyAlgorithm):
                 warnings.simplefilter("ignore")
                 self.replay_buffer.truncate_last_trajectory()
 
-    def _note_reset(self) -> None:
+    def keep_first_observations(self) -> None:
         """The environments were just reset: ``_last_obs`` is their first observation."""
-        assert self.env is not None
         assert isinstance(self._last_obs, dict)
         self._last_original_obs = self.replay_source.observation(self._last_obs)
-        self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
-        self._begin_episodes(self.env.num_envs)
-        self._note_use()
-
-    def _begin_episodes(self, n_envs: int) -> None:
-        self.acting = [str(self.policy.roles.behaviour)] * n_envs  # type: ignore[union-attr]
-        self._returns_so_far, self._has_warmed_up = np.zeros(n_envs), np.zeros(n_envs, dtype=bool)
-
-    def _note_use(self) -> None:
-        """Whatever was done to the environments so far was done from here."""
-        assert self.env is not None
-        guard = guard_of(self.env)
-        self._last_use = (guard, guard.uses)
-
-    def _reset_if_used_elsewhere(self, env: VecEnv) -> None:
-        """Episodes under way end where somebody else has stepped or reset the environments, or they are others than before."""
-        guard = guard_of(env)
-        if self._last_obs is not None and self._last_use == (guard, guard.uses):
-            return
-        if self._last_obs is not None and not self._used_elsewhere_said:
-            warnings.warn(
-                "The training environments were stepped or reset from outside the training, as by an evaluation on them, or "
-                "force_reset=False was given with others than before: the episodes under way end there, and new ones start. "
-                "Give evaluations an environment of their own.",
-                stacklevel=4,
-            )
-            self._used_elsewhere_said = True
-        self._cut_episodes()
-        self._last_obs = env.reset()  # type: ignore[assignment]
-        self._note_reset()
 
     # --- steps ------------------------------------------------------------------------------------------------------
 
@@ -202,16 +222,16 @@ class DataCollection(OffPolicyAlgorithm):
         while continue_training and should_collect_more_steps(train_freq, self._rollout_steps, self._rollout_episodes):
             if env is not self.env:  # a callback has set others
                 env, replay_buffer, action_noise = self.env, self.replay_buffer, self.action_noise  # type: ignore[assignment]
-            self._reset_if_used_elsewhere(env)
+            self.reset_if_used_elsewhere(env)
             actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
             new_obs, rewards, dones, infos = env.step(actions)
-            self._note_use()
+            self.note_use()
             self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)  # type: ignore[arg-type]
             self.num_timesteps += env.num_envs
             self._rollout_steps += 1
             self._update_info_buffer(infos, dones)
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self._call_hooks(dones)
+            self.call_hooks(dones)
             self._on_step()
             logs_are_due = self._count_episodes(dones, action_noise, log_interval)
             num_collected_steps, num_collected_episodes = self._rollout_steps, self._rollout_episodes
@@ -224,13 +244,6 @@ class DataCollection(OffPolicyAlgorithm):
             callback.on_rollout_end()
             self._rollout_steps, self._rollout_episodes = 0, 0
         return result
-
-    def _call_hooks(self, dones: np.ndarray) -> None:
-        for index in np.flatnonzero(dones).tolist():
-            role = None if self._has_warmed_up[index] else self.acting[index]
-            self.on_episode_end(index, float(self._returns_so_far[index]), role)
-        self._returns_so_far[dones], self._has_warmed_up[dones] = 0.0, False
-        self.on_step()
 
     def _count_episodes(self, dones: np.ndarray, action_noise: ActionNoise | None, log_interval: int | None) -> bool:
         """
@@ -273,4 +286,13 @@ class DataCollection(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         of_the_data = ["_rollout_steps", "_rollout_episodes"]  # steps that a file of the model leaves behind
-        return [*super()._excluded_save_params(), "_replay_source", "_last_use", *of_the_data]
+        of_files = ["_saved_blocks", "_resumed_noise"]
+        return [*super()._excluded_save_params(), "_replay_source", *of_the_data, *of_files]
+
+
+def _check_number(buffer: Any, n_envs: int, remedy: str = "load the model with as many environments") -> None:
+    if buffer.n_envs != n_envs:
+        raise OtherNumberOfEnvironmentsError(
+            f"The replay buffer was filled by {buffer.n_envs} environments, but the model has {n_envs}: {remedy}, or leave "
+            "the buffer out."
+        )

@@ -1,30 +1,30 @@
-"""What an off-policy algorithm does when its environments fail or are not those that it was made for: nothing is lost."""
+"""What an algorithm does when its environments fail, are others than before, or are used by somebody else: nothing is lost."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
 from sb3_gac.base.arguments import needed_arguments_from, present_names
-from sb3_gac.base.collecting import DataCollection
 from sb3_gac.base.overrides import check_names, check_unchanged, check_whose
-from sb3_gac.checks.arguments import KEPT_AS, check_train_freq, merged
-from sb3_gac.checks.environments import FAULTS
+from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.checks.arguments import KEPT_AS, merged
+from sb3_gac.checks.environments import FAULTS, EnvironmentGuard, guard_environments, guard_of
+from sb3_gac.checks.requirements import check_environment
 from sb3_gac.checks.values import as_sentence, check_same_spaces
 
 
-class OtherNumberOfEnvironmentsError(AssertionError, ValueError):
-    """The replay buffer was filled by as many environments as the model does not have. SB3 raises AssertionError here."""
-
-
-class FaultTolerance(DataCollection):
+class FaultTolerance(BaseAlgorithm):
     """
     Environments are guarded, see :mod:`sb3_gac.checks.environments`; a fault ends the episode and costs nothing else.
 
@@ -32,35 +32,39 @@ class FaultTolerance(DataCollection):
     """
 
     restored_arguments: ClassVar[tuple[str, ...]]
-    _behaviour_state: Any
-    _make_replay_buffer: Callable[[], ReplayBuffer]
-    _fit_action_noise: Callable[[], None]
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
+    policy: AsymmetricPolicy
+    #: Guard of the environments that were last used from here, and what it had counted by then
+    _last_use: tuple[EnvironmentGuard | None, int] = (None, 0)
+    _used_elsewhere_said = False
+    begin_episodes: Callable[[int], None]
     _change_arguments: Callable[[dict[str, Any]], None]
+    #: The environments are about to be reset: what was stored last is not continued by what comes next
+    cut_episodes: Callable[[], None]
+    #: The environments were just reset: what is to be stored of ``_last_obs``
+    keep_first_observations: Callable[[], None]
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """
+        Whatever environment the model is given comes through here.
+
+        :raises ValueError: see :func:`check_environment`
+        """
+        check_environment(env)
+        wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        guard_environments(wrapped)
+        return wrapped
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        See SB3's ``set_env``; as long as nothing is in the replay buffer, the number of environments may be another one.
+        See SB3's ``set_env``.
 
-        :raises ValueError: naming the observation entries whose spaces are not the model's, or if the replay buffer was
-            filled by another number of environments
+        :raises ValueError: naming the observation entries whose spaces are not the model's
         """
         env = self._wrap_env(env, self.verbose)
-        _check_spaces(self, env, "environment")
-        buffer = self.replay_buffer
-        if buffer is not None and buffer.n_envs != env.num_envs:
-            if buffer.size() > 0:
-                _check_number(buffer, env.num_envs, f"{type(self).__name__}.load(path, env=...) takes any number")
-            self.replay_buffer = None
-        if env.num_envs != self.n_envs:
-            check_train_freq("train_freq", self.train_freq, env.num_envs)
-            self.n_envs, self._last_obs, self._behaviour_state = env.num_envs, None, None
-            self._fit_action_noise()
+        check_same_spaces_as(self, env, "environment")
         super().set_env(env, force_reset)
-        if self.replay_buffer is None:
-            self.replay_buffer = self._make_replay_buffer()
-        if isinstance(self.replay_buffer, HerReplayBuffer):
-            self.replay_buffer.env = self.env  # which rewards goals: SB3 would ask the one before
-        _ = self.replay_source  # which may refuse, or warn
 
     @classmethod
     def load(
@@ -103,7 +107,7 @@ class FaultTolerance(DataCollection):
             check_unchanged("policy_kwargs", given.pop("policy_kwargs"), saved["policy_kwargs"], "load()")
         if env is not None:
             env = cls._wrap_env(env, saved.get("verbose", 0))
-            _check_spaces(SimpleNamespace(**saved), env, "environment")
+            check_same_spaces_as(SimpleNamespace(**saved), env, "environment")
             force_reset = force_reset or env.num_envs != saved["n_envs"]
         former = {name: saved.pop(name) for name in merged(cls, "renamed_arguments") if name in saved}
         present = {name: value for name, value in present_names(cls, former, None).items() if name not in saved}
@@ -112,40 +116,66 @@ class FaultTolerance(DataCollection):
             model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **attributes)
         for name in former:
             del vars(model)[name]
-        model.policy.freeze_as_saved()  # type: ignore[operator]
+        model.policy.freeze_as_saved()
         model._change_arguments(later)
         return model
 
-    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
-        """
-        See SB3's ``load_replay_buffer``.
+    # --- episodes ---------------------------------------------------------------------------------------------------
 
-        :raises ValueError: naming the observation entries whose spaces are not the model's, or if another number of
-            environments filled it; the buffer stays what it was
-        """
-        before = self.replay_buffer
+    def learn(self, *args: Any, **kwargs: Any) -> Self:
+        """See SB3's ``learn``. After an interrupt, as by Ctrl-C, the next one starts with a reset of the environments."""
         try:
-            super().load_replay_buffer(path, truncate_last_traj)
-        finally:
-            loaded, self.replay_buffer = self.replay_buffer, before
-        assert loaded is not None
-        _check_spaces(self, loaded, "replay buffer")
-        if self.env is not None:
-            _check_number(loaded, self.n_envs)
-        self.replay_buffer = loaded
+            return super().learn(*args, **kwargs)  # type: ignore[safe-super]
+        except BaseException as error:
+            if not isinstance(error, Exception):
+                self._last_obs = None
+            raise
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        if self.replay_buffer is None and self.env is not None:
-            self.replay_buffer = self._make_replay_buffer()
-        if self.replay_buffer is not None:
-            _check_number(self.replay_buffer, self.n_envs)
+    def _setup_learn(self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any) -> Any:
+        resets = reset_num_timesteps or self._last_obs is None
+        if resets:
+            self.cut_episodes()
         with self._step_named():
-            return super()._setup_learn(*args, **kwargs)
+            result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
+        if resets:
+            self.note_reset()
+        return result
 
-    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
         """See SB3's ``collect_rollouts``."""
         with self._step_named():
-            return super().collect_rollouts(*args, **kwargs)
+            return super().collect_rollouts(*args, **kwargs)  # type: ignore[misc]
+
+    def note_reset(self) -> None:
+        """The environments were just reset: ``_last_obs`` is their first observation."""
+        assert self.env is not None
+        self.keep_first_observations()
+        self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
+        self.begin_episodes(self.env.num_envs)
+        self.note_use()
+
+    def note_use(self) -> None:
+        """Whatever was done to the environments so far was done from here."""
+        assert self.env is not None
+        guard = guard_of(self.env)
+        self._last_use = (guard, guard.uses)
+
+    def reset_if_used_elsewhere(self, env: VecEnv) -> None:
+        """Episodes under way end where somebody else has stepped or reset the environments, or they are others than before."""
+        guard = guard_of(env)
+        if self._last_obs is not None and self._last_use == (guard, guard.uses):
+            return
+        if self._last_obs is not None and not self._used_elsewhere_said:
+            warnings.warn(
+                "The training environments were stepped or reset from outside the training, as by an evaluation on them, or "
+                "force_reset=False was given with others than before: the episodes under way end there, and new ones start. "
+                "Give evaluations an environment of their own.",
+                stacklevel=4,
+            )
+            self._used_elsewhere_said = True
+        self.cut_episodes()
+        self._last_obs = env.reset()  # type: ignore[assignment]
+        self.note_reset()
 
     @contextmanager
     def _step_named(self) -> Iterator[None]:
@@ -157,6 +187,9 @@ class FaultTolerance(DataCollection):
             if isinstance(error, FAULTS):
                 error.args = (f"{as_sentence(error)} It happened after {self.num_timesteps} steps (num_timesteps).",)
             raise
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_last_use"]
 
 
 @contextmanager
@@ -178,14 +211,12 @@ def networks_named(path: Any, given: list[str]) -> Iterator[None]:
         ) from error
 
 
-def _check_number(buffer: Any, n_envs: int, remedy: str = "load the model with as many environments") -> None:
-    if buffer.n_envs != n_envs:
-        raise OtherNumberOfEnvironmentsError(
-            f"The replay buffer was filled by {buffer.n_envs} environments, but the model has {n_envs}: {remedy}, or leave "
-            "the buffer out."
-        )
-
-
-def _check_spaces(model: Any, other: Any, whose: str) -> None:
+def check_same_spaces_as(model: Any, other: Any, whose: str) -> None:
+    """
+    :param model: has observation and action space
+    :param other: has such as well
+    :param whose: the other ones are, for the message
+    :raises ValueError: naming the entries that differ
+    """
     check_same_spaces("Observation", model.observation_space, other.observation_space, whose)
     check_same_spaces("Action", model.action_space, other.action_space, whose)

@@ -51,8 +51,7 @@ class FrozenPolicy(nn.Module):
         """
         policy: Any = self.policy
         if isinstance(policy, AsymmetricPolicy):
-            outputs = {role: getattr(policy, role).distribution(obs) for role in policy.roles.policies}
-            return policy.acting_distributions(outputs)[policy.roles.behaviour]
+            return policy.behaviour_distribution(obs)
         space = policy.observation_space
         entries = {key: encode(obs[key], space[key], policy.normalize_images) for key in space.spaces}
         latent = policy.actor.latent_pi(policy.actor.features_extractor(entries))

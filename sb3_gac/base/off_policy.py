@@ -1,9 +1,8 @@
 """What off-policy algorithms with a privileged view share: arguments, their checks, acting and save lists."""
 
-from collections import deque
+import warnings
 from collections.abc import Mapping
 from copy import deepcopy
-from os import PathLike
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,46 +10,31 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self, Unpack
 
-from sb3_gac.base.arguments import ConstructorArguments, OffPolicyArguments, present_names, with_defaults
+from sb3_gac.base.algorithm import AsymmetricAlgorithm
+from sb3_gac.base.arguments import OffPolicyArguments, with_defaults
 from sb3_gac.base.behaviour import Behaviour, BehaviourSpec
-from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
-from sb3_gac.base.overrides import algorithm_of, check_known
-from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
-from sb3_gac.base.resuming import ResumableAlgorithm
-from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_rnn_types, resolve_role_keys, resolve_update_every
-from sb3_gac.base.strict_predict import DeploymentGuard
-from sb3_gac.checks.arguments import (
-    KEPT_AS,
-    SHARED_CHECKS,
-    ArgumentCheck,
-    PlainSchedule,
-    check_arguments,
-    check_train_freq,
-    make_arguments_plain,
-)
+from sb3_gac.base.collecting import DataCollection
+from sb3_gac.base.overrides import check_known, check_unchanged
+from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.base.roles import RoleKeys, resolve_update_every
+from sb3_gac.base.update import Batch
+from sb3_gac.checks.arguments import COMMON_CHECKS, OFF_POLICY_CHECKS, ArgumentCheck, check_train_freq
 from sb3_gac.checks.entries import check_held_by
 from sb3_gac.checks.requirements import check_goals, check_rewards_of_goals
-from sb3_gac.checks.values import plain
-from sb3_gac.networks.heads import check_action_space, resolve_target_entropy
-from sb3_gac.optim.coefficients import Coefficient, DualVariable, make_coefficient
-from sb3_gac.optim.compile import check_can_compile
-from sb3_gac.optim.parallel import has_side_effects
+from sb3_gac.networks.heads import resolve_target_entropy
+from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
-from sb3_gac.replay.episodes import EpisodeReplayBuffer, check_learns_from_sequences
+from sb3_gac.replay.episodes import EpisodeReplayBuffer, SequenceSamples, check_learns_from_sequences
 
 ENT_COEF_START = 0.1
 ENT_COEF_BOUNDS = (1e-8, 1e4)
-#: Options of our replay buffers that say how to sample, not what is stored
-SAMPLING_OPTIONS = ("n_steps", "gamma", "sequence_length", "burn_in")
 
 
-class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, ResumableAlgorithm):
+class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type: ignore[override]
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
 
@@ -102,18 +86,11 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
     :param _init_setup_model: build the networks at construction
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
-    #: Argument -> what raises a ValueError unless it is allowed; a subclass writes its own, its ancestors' count as well
-    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = SHARED_CHECKS
-    #: Arguments that files hold results of: given to ``load`` or ``resume``, they count once those are restored
-    restored_arguments: ClassVar[tuple[str, ...]] = ("ent_coef", "lr_scales", "stats_window_size")
-    #: Arguments that are models, or their paths, and that training asks for their policies, see :attr:`frozen`
-    frozen_arguments: ClassVar[tuple[str, ...]] = ()
-    #: Name of such an argument -> its policy, from the first ``learn`` on
-    frozen: dict[str, FrozenPolicy]
-    policy_class: type[AsymmetricPolicy]
-    policy: AsymmetricPolicy
-    ent_coef_dual: Coefficient
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = OFF_POLICY_CHECKS
+    restored_arguments = (*AsymmetricAlgorithm.restored_arguments, "ent_coef")
+    fixed_arguments = (*AsymmetricAlgorithm.fixed_arguments, "buffer_size", "replay_buffer_class")
+    progress = (*AsymmetricAlgorithm.progress, *DataCollection.collected)
+    _waiting = False
 
     def __init__(
         self,
@@ -122,10 +99,10 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         *sb3: Any,
         **shared: Unpack[OffPolicyArguments],
     ):
-        check_known(type(self), shared)
-        arguments = with_defaults(sb3, shared)
+        check_known(type(self), OffPolicyArguments, shared)
+        arguments = with_defaults(OffPolicyArguments, sb3, shared)
         for name in ("verbose", "device"):  # SB3's constructor uses them
-            SHARED_CHECKS[name](name, arguments[name])
+            COMMON_CHECKS[name](name, arguments[name])
         sets_up = arguments.pop("_init_setup_model")
         self.ent_coef: str | float = arguments.pop("ent_coef")
         self.target_entropy: str | float = arguments.pop("target_entropy")
@@ -151,95 +128,53 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
 
     # --- set-up -----------------------------------------------------------------------------------------------------
 
-    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
-        if policy_name not in self.policy_aliases:
-            raise ValueError(
-                f'policy must be one of {list(self.policy_aliases)} or a policy class, got "{policy_name}": '
-                f'{type(self).__name__} works on Dict observations, for which SB3\'s name is "MultiInputPolicy".'
-            )
-        return self.policy_aliases[policy_name]
-
-    def _setup_lr_schedule(self) -> None:
-        self.lr_schedule = PlainSchedule(self.learning_rate)
-
     def _setup_model(self) -> None:
-        make_arguments_plain(self)
-        self._check_arguments()
-        self.algorithm = algorithm_of(type(self))  # so that a file says whose it is
-        self.algorithm_path = f"{type(self).__module__}:{type(self).__qualname__}"
+        super()._setup_model()
+        self.chooses_behaviour = self._make_behaviour()
+        if self.env is not None:
+            _ = self.replay_source  # which may refuse, or warn
+
+    def _prepare_data(self) -> dict[str, Any]:
         if self.replay_buffer_class is None:
             self.replay_buffer_class = EpisodeReplayBuffer if self.is_recurrent else CompactDictReplayBuffer
         self._fit_action_noise()
         if self.replay_buffer is None and self.env is not None:  # to act takes no memory for training
             self.replay_buffer = self._make_replay_buffer()
-        as_given = {name: getattr(self, name) for name in ("policy_kwargs", "n_steps", "replay_buffer")}
-        self.policy_kwargs = self._all_policy_kwargs()
+        as_given = {name: getattr(self, name) for name in ("n_steps", "replay_buffer")}
         if issubclass(self.replay_buffer_class, CompactDictReplayBuffer):
             self.n_steps = 1  # SB3 warns that it can't pass n_steps on to this buffer: it was
         if self.replay_buffer is None:
             self.replay_buffer = object()  # type: ignore[assignment]  # SB3 would make one
-        try:
-            super()._setup_model()
-        finally:
-            self.__dict__.update(as_given)  # saved as the user gave them
-        side_effects = has_side_effects(self.policy)
-        self._branches_are_independent = (
-            self.device.type == "cpu" and self.policy.branches_are_independent and not side_effects
-        )
-        if self.compile:
-            self._check_can_compile(side_effects)
-        self.chooses_behaviour = self._make_behaviour()
-        self.coefficients = self.make_coefficients()
-        self._keep_coefficients()
-        self.programs = {}
-        self._behaviour_state: BehaviourState = None
-        self.frozen = {}
-        if self.env is not None:  # to act takes no teacher
-            self._load_frozen(needed=False)
-        if self.env is not None:
-            _ = self.replay_source  # which may refuse, or warn
-
-    @property
-    def is_recurrent(self) -> bool:
-        """Whether a network has a memory, so that training takes sequences."""
-        rnn_type = (self.policy_kwargs or {}).get("rnn_type") or self.policy_class.default_rnn_type
-        return any(resolve_rnn_types(self.policy_class.roles, rnn_type).values())
-
-    def _check_can_compile(self, side_effects: bool) -> None:
-        if side_effects:
-            raise ValueError("compile=True can't do dropout or batch normalisation: leave them out, or leave it False.")
-        check_can_compile()
-        for name, network in self.policy.trained.items():
-            if not network.can_be_compiled:
-                raise ValueError(
-                    "compile=True can do torch's Adam and AdamW, without amsgrad, foreach or fused=False, but the optimiser "
-                    f"of {name} is {type(network.optimizer).__name__}: choose another optimizer_class, or leave compile False."
-                )
+        return as_given
 
     def _check_arguments(self) -> None:
-        """
-        :raises ValueError: naming the argument and the remedy
-        """
-        if not (isinstance(self.policy_class, type) and issubclass(self.policy_class, AsymmetricPolicy)):
-            names = list(self.policy_aliases)
-            raise ValueError(f"policy must be one of {names} or a subclass of their classes, got {self.policy_class!r}.")
-        if not hasattr(self, "observation_space"):
-            raise ValueError("env must be an environment, got None: load() alone can do without.")
-        check_action_space(type(self).__name__, self.action_space)
-        check_arguments(self)
+        super()._check_arguments()
         check_train_freq("train_freq", self.train_freq, self.n_envs)
         if self.action_noise is not None and not isinstance(self.action_space, spaces.Box):
             raise ValueError("action_noise can be added to Box actions only: leave it out.")
-        resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
         assert isinstance(self.observation_space, spaces.Dict)
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
         check_goals(self.replay_buffer_class, self.observation_space, self.env)
-        resolve_lr_scales(self.policy_class.roles, self.lr_scales)
         resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
         self._make_behaviour()
         if self.is_recurrent:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
+
+    def check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
+        """See :meth:`ResumableAlgorithm.check_fixed_arguments`; how the replay buffer stores numbers is one of them."""
+        super().check_fixed_arguments(given, before)
+        if "replay_buffer_kwargs" in given and "replay_buffer_kwargs" in before:
+            now, then = ((arguments["replay_buffer_kwargs"] or {}).get("storage_dtype") for arguments in (given, before))
+            check_unchanged("replay_buffer_kwargs' storage_dtype", now, then, "resume()")
+
+    def make_coefficients(self) -> dict[str, Coefficient]:
+        """The entropy temperature, in most algorithms."""
+        return {
+            "ent_coef": make_coefficient(
+                "ent_coef", self.ent_coef, ENT_COEF_START, ENT_COEF_BOUNDS, self.lr_schedule(1), self.device
+            )
+        }
 
     def _make_replay_buffer(self) -> ReplayBuffer:
         assert self.replay_buffer_class is not None
@@ -270,66 +205,6 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
             base.reset()
             self.action_noise = VectorizedActionNoise(base, self.n_envs) if self.n_envs > 1 else base
 
-    def _all_policy_kwargs(self) -> dict[str, Any]:
-        return {**self._policy_options(), **present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")}
-
-    def _policy_options(self) -> dict[str, Any]:
-        """Arguments of the policy class that are arguments of the algorithm."""
-        return {"role_keys": self.role_keys, "lr_scales": self.lr_scales}
-
-    def make_coefficients(self) -> dict[str, Coefficient]:
-        """Name -> what a loss multiplies one of its terms with; the entropy temperature, in most algorithms."""
-        return {
-            "ent_coef": make_coefficient(
-                "ent_coef", self.ent_coef, ENT_COEF_START, ENT_COEF_BOUNDS, self.lr_schedule(1), self.device
-            )
-        }
-
-    def _keep_coefficients(self) -> None:
-        """Under the names that files know them by."""
-        for name, coefficient in self.coefficients.items():
-            setattr(self, f"{name}_dual", coefficient)
-
-    # --- SB3's names ------------------------------------------------------------------------------------------------
-
-    @property
-    def actor(self) -> th.nn.Module:  # type: ignore[override]
-        """The deployed policy; called, it returns actions."""
-        return self.policy.actor  # type: ignore[return-value]
-
-    @property
-    def critic(self) -> th.nn.Module:
-        """The critics that the deployed policy climbs."""
-        return self.policy.critic  # type: ignore[return-value]
-
-    @property
-    def critic_target(self) -> th.nn.Module:
-        """Target of :attr:`critic`."""
-        return self.policy.critic_target  # type: ignore[return-value]
-
-    @property
-    def log_ent_coef(self) -> th.Tensor | None:
-        """Logarithm of a learned entropy temperature; ``None`` if it is fixed, or there is none."""
-        temperature = self.coefficients.get("ent_coef")
-        return temperature.log_value if isinstance(temperature, DualVariable) else None
-
-    @property
-    def ent_coef_tensor(self) -> th.Tensor:
-        """The entropy temperature."""
-        return self.ent_coef_dual.value
-
-    @property
-    def ent_coef_optimizer(self) -> th.optim.Optimizer | None:
-        """Optimiser of a learned entropy temperature; ``None`` if it is fixed, or there is none."""
-        temperature = self.coefficients.get("ent_coef")
-        return None if temperature is None else temperature.optimizer
-
-    def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
-        """Optimisers that follow ``learning_rate``."""
-        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.trained]
-        temperature = self.coefficients.get("ent_coef")
-        return optimizers if temperature is None or temperature.optimizer is None else [*optimizers, temperature.optimizer]
-
     # --- acting -----------------------------------------------------------------------------------------------------
 
     def _sample_action(
@@ -346,7 +221,7 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         warms_up = self.num_timesteps < learning_starts
         episode_starts = np.ones(n_envs, dtype=bool) if self._last_episode_starts is None else self._last_episode_starts
         if len(self.acting) != n_envs:
-            self._begin_episodes(n_envs)
+            self.begin_episodes(n_envs)
         self.acting = self.choose_acting(episode_starts)
         self._has_warmed_up |= warms_up
         if warms_up and not self.is_recurrent:
@@ -387,24 +262,7 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         result = super()._setup_learn(*args, **kwargs)
         assert self.env is not None
         check_rewards_of_goals(self.replay_buffer_class, self.replay_buffer_kwargs, self.env)
-        self._load_frozen(needed=True)
         return result
-
-    def _load_frozen(self, needed: bool) -> None:
-        """
-        :param needed: whether training is about to begin
-        :raises ValueError: if one is not there that is needed, or was trained on other spaces
-        """
-        assert isinstance(self.observation_space, spaces.Dict)
-        for name in set(self.frozen_arguments) - set(self.frozen):
-            source = getattr(self, name)
-            if source is not None:
-                self.frozen[name] = load_frozen_policy(source, self.observation_space, self.action_space, self.device, name)
-            elif needed:
-                raise ValueError(
-                    f"{type(self).__name__} trains with a {name}: pass {name}=<a trained model or its path>, to load() and "
-                    "resume() as well."
-                )
 
     def learn(
         self,
@@ -419,75 +277,63 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         tb_log_name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
-    # --- save and load ----------------------------------------------------------------------------------------------
+    # --- training ---------------------------------------------------------------------------------------------------
 
-    def get_parameters(self) -> dict[str, dict]:
-        """See SB3's ``get_parameters``: optimisers' options are Python's numbers, whatever a schedule or a callback left."""
-        self.policy.refresh_parameters()
-        parameters = super().get_parameters()
-        for name, state in parameters.items():
-            if "optim" in name:
-                state["param_groups"] = plain(state["param_groups"], arrays=True)
-        return parameters
-
-    def set_parameters(
-        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
-    ) -> None:
-        """See SB3's ``set_parameters``; optimisers' state of earlier versions becomes that of present ones."""
-        parameters = load_path_or_dict
-        if not isinstance(parameters, dict):
-            _, parameters, _ = load_from_zip_file(parameters, device=device, load_data=False)
-        parameters = dict(parameters)
-        for role, network in self.policy.trained.items():
-            name = f"policy.{role}.optimizer"
-            if name in parameters:
-                parameters[name] = network.in_present_layout(parameters[name])
-        super().set_parameters(parameters, exact_match, device)
-
-    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
-        """See SB3's ``load_replay_buffer``; how the buffer is sampled is the model's to say, not the file's."""
-        super().load_replay_buffer(path, truncate_last_traj)
-        if isinstance(self.replay_buffer, CompactDictReplayBuffer):
-            options = self._replay_buffer_options()
-            given = {name: options[name] for name in SAMPLING_OPTIONS if name in options and hasattr(self.replay_buffer, name)}
-            vars(self.replay_buffer).update(given)
-
-    def _change_arguments(self, given: dict[str, Any]) -> None:
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """
-        :param given: some of ``restored_arguments``; they take the place of what was restored. A coefficient that is learned
-            before and after goes on from where it was, unless it is given a start value
+        :param gradient_steps: number of gradient steps
+        :param batch_size: transitions per step, B
         """
-        if not given:
+        if self._waits_for_an_episode():
             return
-        before = {name: (getattr(self, name, None), coefficient) for name, coefficient in self.coefficients.items()}
-        vars(self).update({KEPT_AS.get(name, name): value for name, value in given.items()})
-        make_arguments_plain(self)
-        self._check_arguments()
-        self.coefficients = self.make_coefficients()
-        for name, (spec, coefficient) in before.items():
-            spec_now = getattr(self, name, None)
-            if not any(other.startswith(name) for other in given):
-                self.coefficients[name] = coefficient
-            elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, DualVariable)):
-                self.coefficients[name].go_on_from(coefficient)
-        self._keep_coefficients()
-        if "lr_scales" in given:
-            self.policy.scale_learning_rates(self._all_policy_kwargs()["lr_scales"])
-        for buffer in ("ep_info_buffer", "ep_success_buffer"):
-            if getattr(self, buffer) is not None:
-                setattr(self, buffer, deque(getattr(self, buffer), maxlen=self._stats_window_size))
+        update_every = resolve_update_every(self.policy.roles, self.policy_delay, self.update_every)
+        with self.gradient_steps_under_way() as history:
+            for _ in range(gradient_steps):
+                batch = self._sample_batch(batch_size)
+                self._resting = frozenset(name for name, every in update_every.items() if self._n_updates % every)
+                history.append(self._compiled("update", self.update, batch) if self._is_one_program else self.update(batch))
+                self._n_updates += 1
+                if self._n_updates % self.target_update_interval == 0:
+                    self.policy.update_targets(self.tau)
+
+    def _waits_for_an_episode(self) -> bool:
+        """Whether there is nothing yet to learn from; said once. (A full buffer without a whole episode is an error.)"""
+        buffer = self.replay_buffer
+        waits = isinstance(buffer, EpisodeReplayBuffer) and not buffer.full and buffer.n_episodes == 0
+        if waits and not self._waiting:
+            warnings.warn(
+                "There are no gradient steps until the first episode has ended, although "
+                f"learning_starts={self.learning_starts} is over: a recurrent policy learns from whole episodes.",
+                stacklevel=3,
+            )
+        self._waiting = waits
+        return waits
+
+    def example_of_data(self) -> dict[str, th.Tensor]:
+        """A batch of observation entries and rewards as the networks see them, for the diagnosis of a divergence."""
+        batch = self._sample_batch(self.batch_size)
+        assert isinstance(batch.observations, dict)
+        return {**batch.observations, "reward": batch.rewards}
+
+    def _sample_batch(self, batch_size: int) -> Batch:
+        assert self.replay_buffer is not None
+        samples = self.replay_buffer.sample(batch_size, env=self.sampling_env)
+        discounts = getattr(samples, "discounts", None)
+        if discounts is None:
+            discounts = th.full((), self.gamma, device=self.device)
+        if isinstance(samples, SequenceSamples):
+            now = {key: entry[:-1] for key, entry in samples.observations.items()}
+            later = {key: entry[1:] for key, entry in samples.observations.items()}
+            what_happened = (samples.actions, samples.rewards, later, samples.dones)
+            return Batch(now, *what_happened, discounts, samples.observations, samples.mask)
+        return Batch(
+            samples.observations,
+            samples.actions,
+            samples.rewards.flatten(),
+            samples.next_observations,
+            samples.dones.flatten(),
+            discounts.flatten() if discounts.dim() else discounts,
+        )
 
     def _excluded_save_params(self) -> list[str]:
-        coefficients = [f"{name}_dual" for name in self.coefficients]
-        others = ["coefficients", "programs", "_program_key", "chooses_behaviour", "frozen"]
-        others += [name for name in self.frozen_arguments if not isinstance(getattr(self, name), (str, PathLike))]
-        return [*super()._excluded_save_params(), *coefficients, *others]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts = ["policy", *(f"policy.{name}.optimizer" for name in self.policy.trained)]
-        tensors = []
-        for name, coefficient in self.coefficients.items():
-            of_optimizers, of_tensors = coefficient.state_names
-            state_dicts += [f"{name}_dual.{attribute}" for attribute in of_optimizers]
-            tensors += [f"{name}_dual.{attribute}" for attribute in of_tensors]
-        return state_dicts, tensors
+        return [*super()._excluded_save_params(), "chooses_behaviour"]

@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from sb3_gac.base.arguments import OffPolicyArguments
+from sb3_gac.base.arguments import SHARED
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.arguments import constructor_arguments, constructor_parameters
 from sb3_gac.checks.values import plain
@@ -58,14 +58,15 @@ def check_names(kind: type, given: Iterable[str], where: str) -> None:
             raise _unknown(kind, name, where, known)
 
 
-def check_known(kind: type, given: Iterable[str]) -> None:
+def check_known(kind: type, shared: type, given: Iterable[str]) -> None:
     """
     :param kind: an algorithm's class
+    :param shared: table of the arguments that its family shares
     :param given: names of arguments that no constructor of its own has taken
     :raises TypeError: naming those that are not shared ones either, and what may be meant
     """
     for name in given:
-        if name not in OffPolicyArguments.__annotations__:
+        if name not in SHARED[shared].parameters:
             raise _unknown(kind, name, f"{kind.__name__}()", constructor_parameters(kind))
 
 

@@ -33,6 +33,7 @@ from sb3_gac.networks.critics import CriticEnsemble, DiscreteCriticEnsemble
 from sb3_gac.networks.encoders import EntryExtractor, VectorExtractor
 from sb3_gac.networks.heads import LOG_STD_BOUNDS
 from sb3_gac.networks.recurrent import RecurrentCore
+from sb3_gac.networks.values import StateValue
 from sb3_gac.optim.polyak import polyak_average
 from sb3_gac.optim.trained import TrainedParameters
 
@@ -170,6 +171,8 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
                 setattr(self, role, ensemble(**self._role_kwargs(role, shared), n_critics=self.n_critics))
                 self._set_target(role, ensemble(**self._role_kwargs(role, deepcopy(shared)), n_critics=self.n_critics))
 
+        for role in self.roles.values:
+            setattr(self, role, StateValue(**self._role_kwargs(role, shared)))
         pairs = self.pairs.values()
         self._followed: list[th.Tensor] = [parameter for network, _ in pairs for parameter in network.parameters()]
         self._following: list[th.Tensor] = [parameter for _, target in pairs for parameter in target.parameters()]
@@ -320,9 +323,9 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
     # --- acting -----------------------------------------------------------------------------------------------------
 
     @property
-    def branches_are_independent(self) -> bool:
-        """Whether the algorithm's update has branches that share nothing that either changes."""
-        return False
+    def side_branch(self) -> tuple[str, ...]:
+        """Networks whose gradient steps read nothing that those of the others change, and change nothing that those read."""
+        return ()
 
     def check_seen_by(self, role: str, observation: Any, where: str) -> None:
         """
@@ -347,6 +350,14 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         :return: role -> distribution of its actions
         """
         return outputs
+
+    def behaviour_distribution(self, obs: PyTorchObs) -> Distribution:
+        r"""
+        :param obs: full observation, (\*E, ...) of each entry
+        :return: distribution of the actions of the policy that collects the data, shapes (\*E, A)
+        """
+        outputs = {role: getattr(self, role).distribution(obs) for role in self.roles.policies}
+        return self.acting_distributions(outputs)[self.roles.behaviour]
 
     @th.no_grad()
     def behaviour_action(

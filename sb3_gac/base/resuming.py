@@ -4,92 +4,72 @@ import io
 import json
 import random
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from copy import deepcopy
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, TrainFreq
 from typing_extensions import Self
 
 from sb3_gac.base.arguments import present_names
 from sb3_gac.base.faults import networks_named
 from sb3_gac.base.overrides import SETTINGS, check_names, check_unchanged
-from sb3_gac.base.update import NetworkTraining
-from sb3_gac.checkpoint.files import (
-    CheckpointError,
-    checksum,
-    has_block,
-    latest_whole,
-    read_block,
-    write_block,
-    write_checkpoint,
-)
+from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.checkpoint.files import CheckpointError, checksum, latest_whole, write_checkpoint
 from sb3_gac.checkpoint.serialization import UntrustedNameError, decode, encode
 from sb3_gac.checkpoint.vec_env import restore_vec_env_state, vec_env_state
 from sb3_gac.checks.arguments import KEPT_AS, constructor_arguments
-from sb3_gac.replay.buffer import CompactDictReplayBuffer
 
-BLOCK_BYTES = 4 << 20
-#: Attributes of the algorithm that training changes, besides networks, coefficients and the replay buffer
-PROGRESS = (
-    "num_timesteps",
-    "_total_timesteps",
-    "_num_timesteps_at_start",
-    "_episode_num",
-    "_rollout_steps",
-    "_rollout_episodes",
-    "_n_updates",
-    "_last_metrics",
-    "_current_progress_remaining",
-    "_last_obs",
-    "_last_original_obs",
-    "_last_episode_starts",
-    "_behaviour_state",
-    "acting",
-    "_returns_so_far",
-    "_has_warmed_up",
-    "ep_info_buffer",
-    "ep_success_buffer",
-    "strict_deployment",
-    "trained_normalised",
-)
-#: Arguments that what a checkpoint holds was made with
-FIXED = ("policy", "policy_kwargs", "buffer_size", "replay_buffer_class")
 #: Of what a checkpoint holds, what is encoded
 STATES = ("progress", "training_state", "generators", "env", "buffer")
 _STATE, _ARRAYS, _TENSORS = "state.json", "arrays.npz", "tensors.pt"
 
 
-class SavedBlocks(NamedTuple):
+class ResumableAlgorithm(BaseAlgorithm):
     """
-    What a replay buffer's rows were when they were last written.
-
-    :param root: of the checkpoints
-    :param n_added: transitions added by then, per environment
-    :param names: of the blocks, in the order of the rows
-    """
-
-    root: Path
-    n_added: int
-    names: list[str]
-
-
-class ResumableAlgorithm(NetworkTraining):
-    """
-    Adds :meth:`save_checkpoint` and :meth:`resume` to an off-policy algorithm.
+    Adds :meth:`save_checkpoint` and :meth:`resume` to an algorithm.
 
     Files hold JSON, plain arrays and tensors: loading them executes nothing.
     """
 
-    _saved_blocks: SavedBlocks | None = None
-    _resumed_noise: Any = None
+    #: Attributes that training changes, besides networks, coefficients and what the data are held in
+    progress: ClassVar[tuple[str, ...]] = (
+        "num_timesteps",
+        "_total_timesteps",
+        "_num_timesteps_at_start",
+        "_n_updates",
+        "_last_metrics",
+        "_current_progress_remaining",
+        "_last_obs",
+        "_last_episode_starts",
+        "_behaviour_state",
+        "acting",
+        "_returns_so_far",
+        "_has_warmed_up",
+        "ep_info_buffer",
+        "ep_success_buffer",
+        "strict_deployment",
+        "trained_normalised",
+    )
+    #: Arguments that what a checkpoint holds was made with
+    fixed_arguments: ClassVar[tuple[str, ...]] = ("policy", "policy_kwargs")
+    restored_arguments: ClassVar[tuple[str, ...]]
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
+    policy: AsymmetricPolicy
+    _change_arguments: Callable[[dict[str, Any]], None]
+    note_use: Callable[[], None]
+    #: Given the directory of all checkpoints: what is to be written of the data that training holds, and names of blocks
+    #: that were written there
+    save_data: Callable[[Path], tuple[dict[str, Any], list[str]]]
+    #: Given that directory, and what ``save_data`` returned
+    restore_data: Callable[[Path, dict[str, Any]], None]
     #: What :meth:`save_checkpoint` was given to keep, after :meth:`resume`
     resumed_notes: Any = None
 
@@ -115,29 +95,22 @@ class ResumableAlgorithm(NetworkTraining):
         :param notes: of the caller's, anything that JSON can hold, see :attr:`resumed_notes`
         :return: directory of this checkpoint
         :raises OSError: if it can't be written; the checkpoints before it are as they were
-        :raises TypeError: if the replay buffer is of another class than this package's
+        :raises TypeError: if the data are held in what can't be written down, as a replay buffer of another class than this
+            package's
         """
-        buffer = self.replay_buffer
-        if buffer is None:
-            raise TypeError("There is no replay buffer to write down: set_env() gives one to a model that was loaded without.")
-        if not isinstance(buffer, CompactDictReplayBuffer):
-            raise TypeError(
-                f"A checkpoint can hold a CompactDictReplayBuffer or a subclass, but replay_buffer_class is "
-                f"{type(buffer).__name__}: leave it out, or use save() and save_replay_buffer()."
-            )
         root = Path(directory).absolute()
-        saved = self._write_rows(buffer, root)
+        data, blocks = self.save_data(root)
         arrays: dict[str, np.ndarray] = {}
         state = {
             "algorithm": _qualified_name(type(self)),
             "arguments": self._encoded_arguments(arrays),
             "spaces": _describe_spaces(self.observation_space, self.action_space),
             "n_envs": self.n_envs,
-            "progress": encode({name: getattr(self, name) for name in PROGRESS}, arrays),
+            "progress": encode({name: getattr(self, name) for name in self.progress}, arrays),
             "training_state": encode(self.training_state(), arrays),
             "generators": encode(self._generator_states(), arrays),
             "env": encode(None if self.env is None else vec_env_state(self.env), arrays),
-            "buffer": encode(buffer.bookkeeping() | {"blocks": saved.names}, arrays),
+            "buffer": encode(data, arrays),
             "notes": notes,
         }
         files = {
@@ -145,27 +118,7 @@ class ResumableAlgorithm(NetworkTraining):
             _ARRAYS: _in_memory(lambda file: np.savez(file, **arrays)),  # type: ignore[arg-type]
             _TENSORS: _in_memory(lambda file: th.save(self._tensors(), file)),
         }
-        path = write_checkpoint(root, self.num_timesteps, files, saved.names, keep)
-        self._saved_blocks = saved
-        return path
-
-    def _write_rows(self, buffer: CompactDictReplayBuffer, root: Path) -> SavedBlocks:
-        """Blocks of rows that have changed since they were last written there."""
-        arrays, n_rows = buffer.rows_by_name(), buffer.n_rows
-        per_block = _rows_per_block(arrays)
-        n_filled = min(buffer.n_added + 1, n_rows)
-        names = [""] * -(-n_filled // per_block)
-        changed = np.arange(len(names))
-        before = self._saved_blocks
-        if before is not None and before.root == root and buffer.n_added - before.n_added < n_rows - 2:
-            names[: len(before.names)] = before.names
-            # The step before may have been cut, and the newest next observation stands where a step to come will be
-            written = np.arange(max(before.n_added - 1, 0), buffer.n_added + 1) % n_rows // per_block
-            changed = np.union1d(written, [block for block, name in enumerate(names) if not has_block(root, name)])
-        for block in changed.astype(int).tolist():
-            rows = slice(block * per_block, min((block + 1) * per_block, n_filled))
-            names[block] = write_block(root, b"".join(array[rows].tobytes() for array in arrays.values()))
-        return SavedBlocks(root, buffer.n_added, names)
+        return write_checkpoint(root, self.num_timesteps, files, blocks, keep)
 
     def _encoded_arguments(self, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         """Of the constructor, as far as they can be written down; of the others, what can't be."""
@@ -242,7 +195,7 @@ class ResumableAlgorithm(NetworkTraining):
         before = _decoded_arguments(present_names(cls, state["arguments"], None), given, arrays)
         model = cls(env=env, device=device, **before | given)
         model._check_same_spaces(state)
-        model._check_fixed_arguments(given, before)
+        model.check_fixed_arguments(given, before)
         tensors = th.load(io.BytesIO(files[_TENSORS]), map_location=model.device, weights_only=True)
         with networks_named(path, list(given)):
             model._restore(root, tensors, {name: decode(state[name], arrays) for name in STATES if name in state})
@@ -253,15 +206,12 @@ class ResumableAlgorithm(NetworkTraining):
         model.resumed_notes = state["notes"]
         return model
 
-    def _check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
+    def check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
         """Of those that were given: that they are what the checkpoint's networks and buffer were made with."""
-        for name in FIXED:
+        for name in self.fixed_arguments:
             if name in given and name in before:
                 then = self.policy_aliases.get(before[name], before[name]) if name == "policy" else before[name]
                 check_unchanged(name, getattr(self, KEPT_AS.get(name, name)), then, "resume()")
-        if "replay_buffer_kwargs" in given and "replay_buffer_kwargs" in before:
-            now, then = ((arguments["replay_buffer_kwargs"] or {}).get("storage_dtype") for arguments in (given, before))
-            check_unchanged("replay_buffer_kwargs' storage_dtype", now, then, "resume()")
 
     def _check_same_spaces(self, state: dict[str, Any]) -> None:
         now = _describe_spaces(self.observation_space, self.action_space)
@@ -279,26 +229,9 @@ class ResumableAlgorithm(NetworkTraining):
             recursive_setattr(self, f"{name}.data", value.data)
         for name, value in (state["progress"] | state.get("training_state", {})).items():
             setattr(self, name, value)
-        self._resumed_noise = self.action_noise
-        self._read_rows(root, state["buffer"])
+        self.restore_data(root, state["buffer"])
         self._restore_env(state["env"], state["generators"])
         self._restore_generators(state["generators"])
-
-    def _read_rows(self, root: Path, bookkeeping: dict[str, Any]) -> None:
-        buffer = self.replay_buffer
-        assert isinstance(buffer, CompactDictReplayBuffer)
-        names = bookkeeping.pop("blocks")
-        buffer.restore_bookkeeping(bookkeeping)
-        arrays = buffer.rows_by_name()
-        per_block, n_filled = _rows_per_block(arrays), min(buffer.n_added + 1, buffer.n_rows)
-        for block, name in enumerate(names):
-            content, start = memoryview(read_block(root, name)), 0
-            rows = slice(block * per_block, min((block + 1) * per_block, n_filled))
-            for array in arrays.values():
-                part = array[rows]
-                part[...] = np.frombuffer(content[start : start + part.nbytes], dtype=array.dtype).reshape(part.shape)
-                start += part.nbytes
-        self._saved_blocks = SavedBlocks(root, buffer.n_added, names)
 
     def _restore_env(self, state: dict[str, Any] | None, generators: dict[str, Any]) -> None:
         assert self.env is not None
@@ -307,7 +240,7 @@ class ResumableAlgorithm(NetworkTraining):
             warnings.warn(f"Starting new episodes: the environments cannot be restored ({why}).", stacklevel=4)
             self._last_obs = None
             self.env.seed(int(generators["numpy"][1][0]) % 2**31)  # the same for the same checkpoint
-        self._note_use()
+        self.note_use()
 
     def _restore_generators(self, states: dict[str, Any]) -> None:
         """Last: whatever else is restored may draw random numbers."""
@@ -321,33 +254,14 @@ class ResumableAlgorithm(NetworkTraining):
     def learn(self, *args: Any, **kwargs: Any) -> Self:
         """See SB3's ``learn``."""
         with ExitStack() as self.learn_scope:
-            return super().learn(*args, **kwargs)
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, Any]:
-        """SB3 resets the action noise at each ``learn``, but a resumed one goes on."""
-        noise, self._resumed_noise = deepcopy(self._resumed_noise), None
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        if noise is not None and not reset_num_timesteps:
-            self.action_noise = noise
-        return result
+            return super().learn(*args, **kwargs)  # type: ignore[safe-super]
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_saved_blocks", "_resumed_noise", "resumed_notes", "learn_scope"]
+        return [*super()._excluded_save_params(), "resumed_notes", "learn_scope"]
 
 
 def _qualified_name(algorithm: type) -> str:
     return f"{algorithm.__module__}.{algorithm.__qualname__}"
-
-
-def _rows_per_block(arrays: Mapping[str, np.ndarray]) -> int:
-    return max(1, BLOCK_BYTES // sum(array[0].nbytes for array in arrays.values()))
 
 
 def _in_memory(write: Any) -> bytes:

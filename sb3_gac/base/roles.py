@@ -27,6 +27,7 @@ class Roles(NamedTuple):
     :param critics: ensembles that value actions, each with a target
     :param target_policies: those policies that have a target as well
     :param unprivileged: those that see no more than the deployed policy, unless they are told to
+    :param values: networks that value states, without targets
     :param collects: the policy that acts in training, by default the deployed one
     """
 
@@ -35,6 +36,7 @@ class Roles(NamedTuple):
     critics: tuple[str, ...] = ()
     target_policies: tuple[str, ...] = ()
     unprivileged: tuple[str, ...] = ()
+    values: tuple[str, ...] = ()
     collects: str | None = None
 
     @property
@@ -45,7 +47,7 @@ class Roles(NamedTuple):
     @property
     def others(self) -> tuple[str, ...]:
         """Every role but the deployed one."""
-        return (*self.actors, *self.critics)
+        return (*self.actors, *self.critics, *self.values)
 
     @property
     def all(self) -> tuple[str, ...]:

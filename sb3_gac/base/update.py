@@ -1,27 +1,24 @@
-"""The train loop, and the one primitive that a gradient step is put together from: ``minimize``."""
+"""What a gradient step is put together from: batches, losses, and the one primitive ``minimize``."""
 
-import warnings
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from functools import partial
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial, wraps
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_gac.base.faults import FaultTolerance
 from sb3_gac.base.policy import AsymmetricPolicy
-from sb3_gac.base.roles import resolve_update_every
 from sb3_gac.checks.divergence import check_finite_metrics
 from sb3_gac.math.losses import critic_loss, masked_mean, soft_target
 from sb3_gac.networks.actors import RolePolicy
 from sb3_gac.optim.coefficients import Coefficient
 from sb3_gac.optim.compile import Program
-from sb3_gac.optim.parallel import halved_threads, run_side_by_side
-from sb3_gac.replay.episodes import EpisodeReplayBuffer, SequenceSamples
+from sb3_gac.optim.parallel import Worker, worker
 
 #: Name -> detached scalar, left on the device
 Metrics = dict[str, th.Tensor]
@@ -115,49 +112,53 @@ class Loss(NamedTuple):
     metrics: Metrics
 
 
-class Step(NamedTuple):
+def _scheduled(minimize: Callable[..., Metrics]) -> Callable[..., Metrics]:
     """
-    A step down a loss, for :meth:`NetworkTraining.side_by_side`.
+    Where there is a worker, it takes the steps of the side branch, and their metrics are there when it has been waited for.
 
-    :param network: see :meth:`NetworkTraining.minimize`
-    :param loss: see there
-    :param tensors: see there
+    :param minimize: see :meth:`GradientSteps.minimize`
     """
 
-    network: str
-    loss: Callable[..., Loss]
-    tensors: tuple[Any, ...]
+    @wraps(minimize)
+    def scheduled(self: Any, networks: str | tuple[str, ...], loss: Callable[..., Loss], *tensors: Any) -> Metrics:
+        if self._worker is None:
+            return minimize(self, networks, loss, *tensors)
+        run, metrics = partial(minimize, self, networks, loss), Metrics()
+
+        def step() -> None:
+            metrics.update(self._compiled(networks, run, *tensors) if self.compile else run(*tensors))
+
+        self._worker.submit(step) if self._runs_beside(networks) else step()
+        return metrics
+
+    return scheduled
 
 
-class NetworkTraining(FaultTolerance):
+class GradientSteps(BaseAlgorithm):
     """
-    ``train`` for the networks of a policy and their coefficients: a subclass writes one ``update``, made of ``minimize``.
+    Gradient steps of a policy's networks and coefficients: an algorithm writes one ``update``, made of ``minimize``.
 
     What changes from step to step must be a tensor: an argument of a loss, a parameter or a coefficient's value. Numbers that
     a loss finds on ``self`` are named in ``compiled_settings``. The attributes below are those of
-    :class:`sb3_gac.base.off_policy.AsymmetricOffPolicyAlgorithm`.
+    :class:`sb3_gac.base.algorithm.AsymmetricAlgorithm`.
     """
 
     #: Arguments that a compiled update takes for constants: a change compiles it anew
     compiled_settings: ClassVar[tuple[str, ...]] = ("max_grad_norm", "mixed_precision")
     policy: AsymmetricPolicy
     coefficients: dict[str, Coefficient]
-    tau: float
-    target_update_interval: int
     max_grad_norm: float | None
     compile: bool
     mixed_precision: bool
-    policy_delay: int
-    update_every: Mapping[str, int] | None
     programs: dict[Any, Program]
     _branches_are_independent: bool
-    _at_once = False
+    #: Takes the steps of :attr:`AsymmetricPolicy.side_branch`, in a round in which branches run at once
+    _worker: Worker | None = None
     _program_key: tuple[Any, ...] = ()
     #: Networks that the gradient step under way leaves as they are, see ``update_every``
     _resting: frozenset[str] = frozenset()
     #: Of the last round of gradient steps, all finite
     _last_metrics: Mapping[str, float] = MappingProxyType({})
-    _waiting = False
 
     # --- what an algorithm writes, and what it writes it with ---------------------------------------------------------
 
@@ -170,16 +171,21 @@ class NetworkTraining(FaultTolerance):
         :return: to log under "train/"
         """
 
+    @_scheduled
     def minimize(self, networks: str | tuple[str, ...], loss: Callable[..., Loss], *tensors: Any) -> Metrics:
         """
         One step of a network's optimiser down a loss, for which all other networks are constants.
 
-        :param networks: name of one, or of several that share a loss, each with its own optimiser and bound on its gradient
+        :param networks: name of one, or of several that share a loss, each with its own optimiser; the gradient by all of
+            them is scaled to a norm of at most ``max_grad_norm``
         :param loss: function of the tensors
         :param tensors: in tuples or dicts; what changes from step to step
-        :return: the loss under the (first) network's name, the norms of the gradients, and the loss's metrics
+        :return: the loss under the (first) network's name, the norms of the gradients, and the loss's metrics; nothing of a
+            network that an ablation does without
         """
         names = (networks,) if isinstance(networks, str) else networks
+        if not self.policy.has(names[0]):
+            return {}
         with self._precision():
             value, metrics = loss(*tensors)
         metrics = {name: metric.detach() for name, metric in {f"{names[0]}_loss": value, **metrics}.items()}
@@ -188,32 +194,21 @@ class NetworkTraining(FaultTolerance):
         gradients: Sequence[th.Tensor] = ()
         if parameters and value.requires_grad:
             gradients = th.autograd.grad(value, parameters, allow_unused=True, materialize_grads=True)
+        own = dict(zip(trained, _split(gradients, [len(network.parameters) for network in trained.values()]), strict=True))
+        norms = {name: network.norm(own[name]) for name, network in trained.items()}
+        scale = scale_of(list(norms.values()), self.max_grad_norm)
         for name, network in trained.items():
-            own, gradients = gradients[: len(network.parameters)], gradients[len(network.parameters) :]
-            metrics[f"{name}_grad_norm"] = network.step(own, self.max_grad_norm)
-        return metrics
+            network.step(own[name], scale)
+        return metrics | {f"{name}_grad_norm": norm for name, norm in norms.items()}
 
-    def side_by_side(self, *branches: Sequence[Step]) -> Metrics:
+    def joined(self, *steps: Metrics) -> Metrics:
         """
-        The same as ``minimize`` for each step of each branch; branches may run at once.
-
-        :param branches: no step of one changes what a step of another reads, but for what was computed before; steps of
-            networks that an ablation does without are left out
-        :return: metrics of all steps
+        :param steps: what :meth:`minimize` has returned, of steps that may be under way at once
+        :return: all of it, when all is done
         """
-        branches = tuple([step for step in branch if self.policy.has(step.network)] for branch in branches)
-        if not self._at_once:
-            steps = [step for branch in branches for step in branch]
-            return _joined([self.minimize(step.network, step.loss, *step.tensors) for step in steps])
-        return _joined(run_side_by_side([partial(self._run_branch, branch) for branch in branches]))
-
-    def _run_branch(self, branch: Sequence[Step]) -> Metrics:
-        def run(*tensors: Any) -> Metrics:
-            return _joined([self.minimize(s.network, s.loss, *own) for s, own in zip(branch, tensors, strict=True)])
-
-        name = tuple(step.network for step in branch)
-        tensors = [step.tensors for step in branch]
-        return self._compiled(name, run, *tensors) if self.compile else run(*tensors)
+        if self._worker is not None:
+            self._worker.wait()
+        return {name: value for step in steps for name, value in step.items()}
 
     def outputs(self, batch: Batch, *roles: str) -> list[Outputs]:
         """
@@ -222,9 +217,19 @@ class NetworkTraining(FaultTolerance):
         :param batch: of transitions
         :param roles: names of the policies
         """
+        found: dict[str, Outputs] = {}
 
-        passes = [partial(self._outputs_of, role, batch) for role in roles]
-        return run_side_by_side(passes) if self._at_once and len(roles) == 2 else [one() for one in passes]
+        def run(role: str) -> None:
+            found[role] = self._outputs_of(role, batch)
+
+        for role in roles:
+            self._worker.submit(partial(run, role)) if self._runs_beside(role) else run(role)  # type: ignore[union-attr]
+        if self._worker is not None:
+            self._worker.wait()
+        return [found[role] for role in roles]
+
+    def _runs_beside(self, networks: str | tuple[str, ...]) -> bool:
+        return self._worker is not None and networks in self.policy.side_branch
 
     def _outputs_of(self, role: str, batch: Batch) -> Outputs:
         def run(batch: Batch) -> Outputs:
@@ -263,52 +268,38 @@ class NetworkTraining(FaultTolerance):
         """To be logged: name -> value, the mean over dimensions where there are several."""
         return {name: coefficient.value.mean() for name, coefficient in self.coefficients.items()}
 
-    # --- the loop -----------------------------------------------------------------------------------------------------
+    # --- a round of steps ---------------------------------------------------------------------------------------------
 
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+    @contextmanager
+    def gradient_steps_under_way(self) -> Iterator[list[Metrics]]:
         """
-        :param gradient_steps: number of gradient steps
-        :param batch_size: transitions per step, B
+        A round of gradient steps: networks in training mode, learning rates and schedules as they are by now.
+
+        :return: list for the metrics of each step, whose means are logged at the end
         """
-        if self._waits_for_an_episode():
-            return
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._scheduled_optimizers())
         self.policy.refresh_parameters(self.compile)
         self.refresh_schedules()
-        self._at_once = self._branches_are_independent and th.get_num_threads() > 1
         settings = (getattr(self, name) for name in self.compiled_settings)
         self._program_key = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
-        update_every = resolve_update_every(self.policy.roles, self.policy_delay, self.update_every)
         history: list[Metrics] = []
-        with halved_threads(self._at_once):
-            for _ in range(gradient_steps):
-                batch = self._sample_batch(batch_size)
-                self._resting = frozenset(name for name, every in update_every.items() if self._n_updates % every)
-                whole = self.compile and not self._in_several_programs
-                history.append(self._compiled("update", self.update, batch) if whole else self.update(batch))
-                self._n_updates += 1
-                if self._n_updates % self.target_update_interval == 0:
-                    self.policy.update_targets(self.tau)
+        try:
+            with worker(self._branches_are_independent and th.get_num_threads() > 1) as self._worker:
+                yield history
+        finally:
+            self._worker = None
         self._record_metrics(history)
 
-    def _waits_for_an_episode(self) -> bool:
-        """Whether there is nothing yet to learn from; said once. (A full buffer without a whole episode is an error.)"""
-        buffer = self.replay_buffer
-        waits = isinstance(buffer, EpisodeReplayBuffer) and not buffer.full and buffer.n_episodes == 0
-        if waits and not self._waiting:
-            warnings.warn(
-                "There are no gradient steps until the first episode has ended, although "
-                f"learning_starts={self.learning_starts} is over: a recurrent policy learns from whole episodes.",
-                stacklevel=3,
-            )
-        self._waiting = waits
-        return waits
+    @property
+    def _is_one_program(self) -> bool:
+        """Whether a whole update is compiled."""
+        return self.compile and self._worker is None
 
     @property
     def _in_several_programs(self) -> bool:
-        """Whether each branch is compiled by itself."""
-        return self.compile and self._at_once
+        """Whether each step is compiled by itself."""
+        return self.compile and self._worker is not None
 
     def _compiled(self, name: Any, function: Callable[..., Any], *args: Any) -> Any:
         """
@@ -326,26 +317,6 @@ class NetworkTraining(FaultTolerance):
         if self.mixed_precision:
             return th.autocast(self.device.type, th.bfloat16, cache_enabled=False)
         return nullcontext()
-
-    def _sample_batch(self, batch_size: int) -> Batch:
-        assert self.replay_buffer is not None
-        samples = self.replay_buffer.sample(batch_size, env=self.sampling_env)
-        discounts = getattr(samples, "discounts", None)
-        if discounts is None:
-            discounts = th.full((), self.gamma, device=self.device)
-        if isinstance(samples, SequenceSamples):
-            now = {key: entry[:-1] for key, entry in samples.observations.items()}
-            later = {key: entry[1:] for key, entry in samples.observations.items()}
-            what_happened = (samples.actions, samples.rewards, later, samples.dones)
-            return Batch(now, *what_happened, discounts, samples.observations, samples.mask)
-        return Batch(
-            samples.observations,
-            samples.actions,
-            samples.rewards.flatten(),
-            samples.next_observations,
-            samples.dones.flatten(),
-            discounts.flatten() if discounts.dim() else discounts,
-        )
 
     def refresh_schedules(self) -> None:
         """Before a round of gradient steps: put in tensors what schedules say now."""
@@ -386,8 +357,22 @@ class NetworkTraining(FaultTolerance):
         self._last_metrics = values
 
 
-def _joined(metrics: Sequence[Metrics]) -> Metrics:
-    return {name: value for part in metrics for name, value in part.items()}
+def _split(gradients: Sequence[th.Tensor], counts: Sequence[int]) -> Iterator[Sequence[th.Tensor]]:
+    for count in counts:
+        yield gradients[:count]
+        gradients = gradients[count:]
+
+
+def scale_of(norms: Sequence[th.Tensor], max_norm: float | None) -> th.Tensor | None:
+    """
+    :param norms: of parts of a gradient
+    :param max_norm: what the norm of all is to be at most; ``None`` for no bound
+    :return: what the gradient is to be multiplied with, as torch's ``clip_grad_norm_`` has it
+    """
+    if max_norm is None or not norms:
+        return None
+    norm = norms[0] if len(norms) == 1 else th.linalg.vector_norm(th.stack(list(norms)))
+    return (max_norm / (norm + 1e-6)).clamp(max=1.0)
 
 
 def _layout(value: Any) -> Iterator[Any]:

@@ -53,12 +53,12 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
 
     def update(self, batch: Batch) -> Metrics:
         """SAC's; its critics are eq. 15's with the entropy term, its actor eq. 16's without a guider."""
-        beta = self.ent_coef_dual.value
+        beta = self.coefficients["ent_coef"].value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
         (actor,) = self.outputs(batch, "actor")
         metrics = self.minimize("critic", self.critic_loss, batch, actor, noise[0], beta)
         metrics |= self.minimize("actor", self.actor_loss, batch, actor, noise[1], beta)
-        metrics |= self.ent_coef_dual.update(float(self.target_entropy) - metrics["entropy"])
+        metrics |= self.coefficients["ent_coef"].update(float(self.target_entropy) - metrics["entropy"])
         return metrics | self.coefficient_values()
 
     def critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:

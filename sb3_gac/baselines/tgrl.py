@@ -171,7 +171,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
         return [other[role] if starts else role for role, starts in zip(self.acting, episode_start, strict=True)]
 
     def on_episode_end(self, env: int, episode_return: float, role: str | None) -> None:
-        """See :meth:`AsymmetricOffPolicyAlgorithm.on_episode_end`."""
+        """See :meth:`EpisodeHooks.on_episode_end`."""
         if role in self.returns:  # neither the warm-up nor the teacher
             self.returns[role] = [*self.returns[role], episode_return][-self.window :]
 
@@ -186,5 +186,5 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
             self.logger.record("rollout/main_minus_auxiliary", main - auxiliary)
 
     def training_state(self) -> dict[str, Any]:
-        """See :meth:`AsymmetricOffPolicyAlgorithm.training_state`."""
+        """See :meth:`ResumableAlgorithm.training_state`."""
         return {"returns": self.returns, "next_comparison": self.next_comparison}

@@ -7,9 +7,9 @@ from functools import partial
 from typing import Any, TypeAlias
 
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.utils import FloatSchedule
 
@@ -69,7 +69,7 @@ def constructor_parameters(kind: type) -> list[str]:
     return [name for name in names if name != "self"]
 
 
-def make_arguments_plain(model: OffPolicyAlgorithm) -> None:
+def make_arguments_plain(model: BaseAlgorithm) -> None:
     """
     Python's numbers in all arguments, see :func:`plain`.
 
@@ -169,27 +169,11 @@ def check_replay_buffer_class(name: str, value: Any) -> None:
         )
 
 
-#: Of the shared arguments; roles, heads and coefficients check their own, and what depends on others is checked with them
-SHARED_CHECKS: Mapping[str, ArgumentCheck] = {
+#: Of all algorithms' arguments; roles, heads and coefficients check their own, and what depends on others is checked with them
+COMMON_CHECKS: Mapping[str, ArgumentCheck] = {
     "learning_rate": partial(check_schedule, may_be_zero=True),  # so rl_zoo3 loads models to play with
-    "buffer_size": partial(check_integer, low=1),
-    "learning_starts": check_not_negative,
-    "batch_size": partial(check_integer, low=1),
-    "tau": check_fraction,
     "gamma": check_fraction,
-    "train_freq": check_train_freq,
-    "gradient_steps": partial(check_integer, low=-1, remedy="-1 for as many as environment steps"),
-    "action_noise": partial(check_type, types=(ActionNoise, type(None)), expected="an ActionNoise or None"),
-    "replay_buffer_class": check_replay_buffer_class,
-    "replay_buffer_kwargs": partial(check_type, types=Mapping, expected="a dict or None"),
-    "optimize_memory_usage": check_switch,
-    "n_steps": partial(check_integer, low=1),
-    "target_update_interval": partial(check_integer, low=1),
     "max_grad_norm": unless(None, check_positive, remedy="or None for no clipping"),
-    "policy_delay": partial(check_integer, low=1),
-    "update_every": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
-    "behaviour": partial(check_type, types=(str, Mapping, type(None)), expected="a policy's name, a dict of shares or None"),
-    "behaviour_per": partial(check_choice, choices=("episode", "environment")),
     "lr_scales": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
     "role_keys": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
     "compile": check_switch,
@@ -200,4 +184,23 @@ SHARED_CHECKS: Mapping[str, ArgumentCheck] = {
     "verbose": partial(check_integer, low=0),
     "seed": unless(None, check_integer, low=0, high=LARGEST_SEED, remedy="or None"),
     "device": check_device,
+}
+#: Of those that off-policy algorithms have besides
+OFF_POLICY_CHECKS: Mapping[str, ArgumentCheck] = {
+    "buffer_size": partial(check_integer, low=1),
+    "learning_starts": check_not_negative,
+    "batch_size": partial(check_integer, low=1),
+    "tau": check_fraction,
+    "train_freq": check_train_freq,
+    "gradient_steps": partial(check_integer, low=-1, remedy="-1 for as many as environment steps"),
+    "action_noise": partial(check_type, types=(ActionNoise, type(None)), expected="an ActionNoise or None"),
+    "replay_buffer_class": check_replay_buffer_class,
+    "replay_buffer_kwargs": partial(check_type, types=Mapping, expected="a dict or None"),
+    "optimize_memory_usage": check_switch,
+    "n_steps": partial(check_integer, low=1),
+    "target_update_interval": partial(check_integer, low=1),
+    "policy_delay": partial(check_integer, low=1),
+    "update_every": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
+    "behaviour": partial(check_type, types=(str, Mapping, type(None)), expected="a policy's name, a dict of shares or None"),
+    "behaviour_per": partial(check_choice, choices=("episode", "environment")),
 }

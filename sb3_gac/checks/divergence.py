@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_gac.checks.arguments import constructor_parameters
 
@@ -28,7 +28,7 @@ class DivergenceError(RuntimeError):
 
 
 def check_finite_metrics(
-    model: OffPolicyAlgorithm, metrics: dict[str, float], last_good: Mapping[str, float], coefficients: Mapping[str, th.Tensor]
+    model: BaseAlgorithm, metrics: dict[str, float], last_good: Mapping[str, float], coefficients: Mapping[str, th.Tensor]
 ) -> None:
     """
     :param model: that was trained
@@ -54,7 +54,7 @@ def check_finite_metrics(
 
 
 def diagnose(
-    model: OffPolicyAlgorithm, metrics: dict[str, float], last_good: Mapping[str, float], coefficients: Mapping[str, th.Tensor]
+    model: BaseAlgorithm, metrics: dict[str, float], last_good: Mapping[str, float], coefficients: Mapping[str, th.Tensor]
 ) -> dict[str, Any]:
     """
     :param model: that was trained
@@ -63,9 +63,7 @@ def diagnose(
     :param coefficients: of its losses
     :return: all of it that JSON can hold, with the largest absolute values in a batch as the networks see it
     """
-    assert model.replay_buffer is not None
-    samples = model.replay_buffer.sample(model.batch_size, env=model.sampling_env)  # type: ignore[attr-defined]
-    entries: Any = {**samples.observations, "reward": samples.rewards}  # type: ignore[dict-item]
+    entries: Mapping[str, th.Tensor] = model.example_of_data()  # type: ignore[attr-defined]
     diagnosis = {
         "num_timesteps": model.num_timesteps,
         "n_updates": model._n_updates,
@@ -95,7 +93,7 @@ def write_diagnosis(diagnosis: dict[str, Any], directory: str | None, step: int)
     return path
 
 
-def _arguments(model: OffPolicyAlgorithm) -> dict[str, Any]:
+def _arguments(model: BaseAlgorithm) -> dict[str, Any]:
     """What the constructor was given, as far as the model has kept it."""
     names = [name for name in constructor_parameters(type(model)) if name in vars(model) and name != "env"]
     return {name: getattr(model, name) for name in names} | {"policy": model.policy_class.__name__}

@@ -88,6 +88,14 @@ def check_fraction(name: str, value: Any) -> None:
     _check_number(name, value, 0 <= _number(value) <= 1, "from 0 to 1")
 
 
+def check_inner_fraction(name: str, value: Any) -> None:
+    """
+    :raises ValueError: unless ``value`` is a number between 0 and 1, and neither
+    """
+    if not 0 < _number(value) < 1:
+        raise ValueError(f"{name} must be a number between 0 and 1, got {value!r}.")
+
+
 def _number(value: Any) -> float:
     try:
         return math.nan if isinstance(value, str) else float(value)

@@ -113,9 +113,10 @@ class GACPolicy(AsymmetricPolicy):
         return self.guider_critic_target if self.learner_critic_target is None else self.learner_critic_target
 
     @property
-    def branches_are_independent(self) -> bool:
-        """Not where the learner climbs the guided critics."""
-        return self.learner_critic is not None and not self.share_features_extractor
+    def side_branch(self) -> tuple[str, ...]:
+        """The guider's, unless the learner climbs the guided critics."""
+        independent = self.learner_critic is not None and not self.share_features_extractor
+        return ("guider", "guider_critic") if independent else ()
 
     def distributions(self, obs: PyTorchObs) -> ActionDistributions:
         """

@@ -40,7 +40,26 @@ class TanhGaussian(NamedTuple):
 
     def sample(self) -> th.Tensor:
         """Reparameterised action in [-1, 1], shape (\\*E, A)."""
-        return th.tanh(self._pre_tanh(th.randn_like(self.mean)))
+        return self.action(self.draw())
+
+    def draw(self) -> th.Tensor:
+        """What :meth:`log_prob` and :meth:`action` take: an action before tanh, shape (\\*E, A)."""
+        return self._pre_tanh(th.randn_like(self.mean))
+
+    @staticmethod
+    def action(drawn: th.Tensor) -> th.Tensor:
+        """
+        :param drawn: see :meth:`draw`
+        :return: in [-1, 1], shape (\\*E, A)
+        """
+        return th.tanh(drawn)
+
+    def entropy(self, noise: th.Tensor) -> th.Tensor:
+        """
+        :param noise: standard normal, shape (\\*E, A)
+        :return: estimate by one sample, shape (\\*E)
+        """
+        return -self.sample_with_log_prob(noise)[1]
 
     def sample_with_log_prob(self, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -144,6 +163,33 @@ class Categorical(NamedTuple):
         """An action, int64, shape (\\*E)."""
         gumbel = -th.empty_like(self.logits).exponential_().log()
         return (self.logits + gumbel).argmax(dim=-1)
+
+    def draw(self) -> th.Tensor:
+        """What :meth:`log_prob` and :meth:`action` take: the number of an action, int64, shape (\\*E, 1)."""
+        return self.sample()[..., None]
+
+    @staticmethod
+    def action(drawn: th.Tensor) -> th.Tensor:
+        """
+        :param drawn: see :meth:`draw`
+        :return: number of an action, shape (\\*E)
+        """
+        return drawn.squeeze(-1)
+
+    def log_prob(self, drawn: th.Tensor) -> th.Tensor:
+        """
+        :param drawn: number of an action, shape (\\*E, 1)
+        :return: shape (\\*E)
+        """
+        return self.logits.log_softmax(dim=-1).gather(-1, drawn.long()).squeeze(-1)
+
+    def entropy(self, noise: th.Tensor) -> th.Tensor:
+        """
+        :param noise: not needed
+        :return: exact, shape (\\*E)
+        """
+        log_probs = self.logits.log_softmax(dim=-1)
+        return -(log_probs.exp() * log_probs).sum(dim=-1)
 
     def value_and_log_prob(self, q_function: QFunction, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

@@ -129,6 +129,24 @@ def policy_loss(
     return masked_mean(kl_coef * kl + ent_coef * log_prob - q.amin(dim=0), mask)
 
 
+def clipped_surrogate(
+    log_ratio: th.Tensor, advantages: th.Tensor, epsilon: th.Tensor, *, clipped_from: th.Tensor | None = None
+) -> th.Tensor:
+    """
+    PPO's objective (Schulman et al. 2017, arXiv 1707.06347, eq. 7), as a loss.
+
+    :param log_ratio: of an action's probability to that under the policy which took it, shape (B,)
+    :param advantages: of the actions, shape (B,)
+    :param epsilon: how far from one the clipped ratio may be, scalar
+    :param clipped_from: logarithm of what is clipped, where that is not the ratio itself, shape (B,)
+    :return: scalar
+    :raises ValueError: naming the tensor whose shape is not (B,)
+    """
+    _check_shapes(log_ratio.shape, advantages=advantages, clipped_from=clipped_from)
+    clipped = (log_ratio if clipped_from is None else clipped_from).exp().clamp(1 - epsilon, 1 + epsilon)
+    return -th.minimum(log_ratio.exp() * advantages, clipped * advantages).mean()
+
+
 def distillation_loss(kl: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
     """
     Learner objective without reinforcement learning (eq. 14).

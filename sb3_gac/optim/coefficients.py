@@ -5,6 +5,7 @@ All have a ``value`` to multiply with, ``update(violation)`` to learn from, and 
 """
 
 import math
+from abc import ABC, abstractmethod
 from typing import Any
 
 import torch as th
@@ -72,9 +73,38 @@ class AdditiveCoefficient(FixedCoefficient):
         return ((self.value <= low) | (self.value >= high)).float()
 
 
-class SoftplusDual:
+class MultiplicativeCoefficient(FixedCoefficient):
     """
-    Positive coefficients softplus(x), x learned by gradient steps on a dual loss: they rise while constraints are violated.
+    A coefficient that is moved by a factor, up or down, and that starts at nought.
+
+    :param first: what nought becomes when it is first moved up
+    :param factor: of a move
+    :param largest: value
+    :param device: where its tensor lives
+    """
+
+    def __init__(self, first: float, factor: float, largest: float, device: th.device):
+        super().__init__(0.0, device)
+        self.first = first
+        self.factor = factor
+        self.largest = largest
+
+    def move(self, up: th.Tensor) -> None:
+        """
+        :param up: whether to, a boolean scalar; otherwise it goes down
+        """
+        moved = th.where(up, self.value * self.factor, self.value / self.factor)
+        risen = th.where(up & (self.value == 0), th.full_like(self.value, self.first), moved)
+        self.value.copy_(risen.clamp(max=self.largest))
+
+    def at_bound(self) -> th.Tensor:
+        """1 if the coefficient has its largest value, else 0, scalar."""
+        return (self.value >= self.largest).float()
+
+
+class LearnedCoefficient(ABC):
+    """
+    Positive coefficients f(x), x learned by gradient steps on a dual loss: they rise while constraints are violated.
 
     :param name: what its loss is named after
     :param initial: start value, inside the bounds
@@ -105,20 +135,20 @@ class SoftplusDual:
         self._trained = TrainedParameters([self.parameter], self.optimizer)  # type: ignore[list-item]
 
     @staticmethod
+    @abstractmethod
     def _inverse(value: float) -> float:
         """
         :param value: of a coefficient
         :return: x
         """
-        return value + math.log(-math.expm1(-value))
 
     @staticmethod
+    @abstractmethod
     def _value_and_slope(parameter: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param parameter: x
         :return: coefficient, and its derivative by x
         """
-        return F.softplus(parameter), parameter.sigmoid()
 
     @property
     def value(self) -> th.Tensor:
@@ -139,7 +169,7 @@ class SoftplusDual:
 
         :param other: learned as well
         """
-        assert isinstance(other, SoftplusDual)
+        assert isinstance(other, LearnedCoefficient)
         assert self.optimizer is not None
         assert other.optimizer is not None
         learning_rate = self.optimizer.param_groups[0]["lr"]
@@ -182,7 +212,19 @@ class SoftplusDual:
         return samples.where(counts, 0.0).sum(dim=0) / counts.sum().clamp(min=1)
 
 
-class DualVariable(SoftplusDual):
+class SoftplusDual(LearnedCoefficient):
+    """Dual variables softplus(x): steps are of one size where they are large."""
+
+    @staticmethod
+    def _inverse(value: float) -> float:
+        return value + math.log(-math.expm1(-value))
+
+    @staticmethod
+    def _value_and_slope(parameter: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        return F.softplus(parameter), parameter.sigmoid()
+
+
+class DualVariable(LearnedCoefficient):
     """A dual variable exp(x), as SAC's temperature: steps are relative to its size."""
 
     state_names = (["optimizer"], ["log_value"])
@@ -202,7 +244,7 @@ class DualVariable(SoftplusDual):
         return value, value
 
 
-Coefficient = FixedCoefficient | SoftplusDual
+Coefficient = FixedCoefficient | LearnedCoefficient
 
 
 def make_coefficient(

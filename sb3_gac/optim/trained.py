@@ -131,17 +131,31 @@ class TrainedParameters:
                 entries[index][name] = part.reshape(shape).clone() if flat else part
         return {"state": entries, "param_groups": [{**group, "params": list(range(len(self.everything)))}]}
 
-    def step(self, gradients: Sequence[th.Tensor], max_norm: float | None) -> th.Tensor:
+    def norm(self, gradients: Sequence[th.Tensor]) -> th.Tensor:
+        """
+        :param gradients: of each trained parameter
+        :return: norm of those that are clipped, scalar
+        """
+        norms = [th.linalg.vector_norm(gradient) for gradient in self._clipped(gradients)]
+        if not norms:
+            return th.zeros((), device=self.everything[0].device if self.everything else None)
+        return th.linalg.vector_norm(th.stack(norms))
+
+    def _clipped(self, gradients: Sequence[th.Tensor]) -> list[th.Tensor]:
+        return [gradient for gradient, clips in zip(gradients, self.clipped, strict=True) if clips]
+
+    def step(self, gradients: Sequence[th.Tensor], scale: th.Tensor | None = None) -> None:
         """
         One step of the optimiser.
 
         :param gradients: of each trained parameter
-        :param max_norm: scale the gradients to a norm of at most this; ``None`` leaves them as they are
-        :return: norm of the gradients before, scalar
+        :param scale: of those that are clipped, scalar; ``None`` leaves them as they are
         """
-        gradients, norm = self._clip(gradients, max_norm)
         if not gradients:
-            return norm
+            return
+        if scale is not None and any(self.clipped):
+            scaled = iter(th._foreach_mul(self._clipped(gradients), scale))
+            gradients = [next(scaled) if clips else g for g, clips in zip(gradients, self.clipped, strict=True)]
         with th.no_grad():
             if self.adam is not None:
                 adam_step(self.adam, gradients, self.optimizer.param_groups[0])
@@ -149,17 +163,6 @@ class TrainedParameters:
                 for parameter, gradient in zip(self.parameters, gradients, strict=True):
                     parameter.grad = gradient
                 self.optimizer.step()
-        return norm
-
-    def _clip(self, gradients: Sequence[th.Tensor], max_norm: float | None) -> tuple[list[th.Tensor], th.Tensor]:
-        bounded = [gradient for gradient, clips in zip(gradients, self.clipped, strict=True) if clips]
-        if not bounded:
-            return list(gradients), th.zeros((), device=self.everything[0].device if self.everything else None)
-        norm = th.linalg.vector_norm(th.stack([th.linalg.vector_norm(gradient) for gradient in bounded]))
-        if max_norm is None:
-            return list(gradients), norm
-        scaled = iter(th._foreach_mul(bounded, (max_norm / (norm + 1e-6)).clamp(max=1.0)))
-        return [next(scaled) if clips else g for g, clips in zip(gradients, self.clipped, strict=True)], norm
 
 
 def _is_plain_adam(optimizer: th.optim.Optimizer) -> bool:

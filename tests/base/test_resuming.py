@@ -211,7 +211,7 @@ def test_another_process_goes_on(tmp_path):
 def test_only_what_has_changed_of_the_buffer_is_written(tmp_path, monkeypatch):
     model = small_model(_bandits(), buffer_size=1_000)
     row_bytes = sum(rows[0].nbytes for rows in model.replay_buffer.rows_by_name().values())
-    monkeypatch.setattr("sb3_gac.base.resuming.BLOCK_BYTES", 50 * row_bytes)
+    monkeypatch.setattr("sb3_gac.checkpoint.rows.BLOCK_BYTES", 50 * row_bytes)
     model.learn(400)
     model.save_checkpoint(tmp_path)
     before = {path.name for path in (tmp_path / "blocks").iterdir()}
@@ -232,7 +232,7 @@ def test_each_checkpoint_has_every_row_that_changed_since_the_one_before(rows_pe
     """The step before may have been cut since, and the newest next observation stands where the next step will be."""
     model = small_model(_bandits(), buffer_size=buffer_size)
     row_bytes = sum(rows[0].nbytes for rows in model.replay_buffer.rows_by_name().values())
-    monkeypatch.setattr("sb3_gac.base.resuming.BLOCK_BYTES", rows_per_block * row_bytes)
+    monkeypatch.setattr("sb3_gac.checkpoint.rows.BLOCK_BYTES", rows_per_block * row_bytes)
     for steps, reset in ((10, True), (1, True), (2, False), (1, False), (3, True), (20, False)):
         model.learn(steps, reset_num_timesteps=reset)
         model.save_checkpoint(tmp_path)

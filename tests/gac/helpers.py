@@ -1,8 +1,17 @@
 """What tests of a gradient step share."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-from sb3_gac.base.update import Batch, Step
+from sb3_gac.base.update import Batch, Loss
+
+
+class Step(NamedTuple):
+    """What is handed to ``minimize``."""
+
+    network: str
+    loss: Callable[..., Loss]
+    tensors: tuple[Any, ...]
 
 
 def steps_of(model: Any, batch: Batch) -> list[Step]:
@@ -12,18 +21,18 @@ def steps_of(model: Any, batch: Batch) -> list[Step]:
     class StopHereError(Exception):
         """Instead of the steps."""
 
-    def gather(*branches: Any) -> Any:
-        found.extend(step for branch in branches for step in branch if model.policy.has(step.network))
+    def stop(*steps: Any) -> Any:
         raise StopHereError
 
-    model.side_by_side = gather
+    model.minimize = lambda network, loss, *tensors: found.append(Step(network, loss, tensors))
+    model.joined = stop
     try:
         model.update(batch)
     except StopHereError:
         pass
     finally:
-        del model.side_by_side
-    return found
+        del model.minimize, model.joined
+    return [step for step in found if model.policy.has(step.network)]
 
 
 def batch_of(obs: Any) -> Batch:

@@ -6,6 +6,7 @@ import pytest
 import torch as th
 from torch import nn
 
+from sb3_gac.base.update import scale_of
 from sb3_gac.optim.trained import TrainedParameters
 
 ADAMS = [th.optim.Adam, th.optim.AdamW]
@@ -67,7 +68,8 @@ def test_the_norm_of_the_clipped_alone_is_bounded_and_a_small_one_is_left_alone(
     ours = _parameters((3, 2), (2,), (4,))
     theirs = deepcopy(ours)
     trained = TrainedParameters(ours, th.optim.SGD(ours, lr=1.0), unclipped)
-    norm = trained.step(_gradients(ours, 1, scale), max_norm=0.5)
+    norm = trained.norm(_gradients(ours, 1, scale))
+    trained.step(_gradients(ours, 1, scale), scale_of([norm], 0.5))
     for p, gradient in zip(theirs, _gradients(theirs, 1, scale), strict=True):
         p.grad = gradient
     clipped = theirs[: 3 - unclipped]
@@ -92,8 +94,8 @@ def test_what_is_known_of_a_frozen_one_is_forgotten(optimizer_class, options):
     trained.refresh()
     assert set(trained.optimizer.state) == {parameters[1]}
     assert trained.trained == trained.optimizer.param_groups[0]["trained"] == [False, True]
-    norm = trained.step(_gradients(trained.parameters, 1), 1e-9)
-    assert norm.item() == 0.0, "the one that is left has no say in clipping"
+    assert trained.norm(_gradients(trained.parameters, 1)).item() == 0.0, "the one that is left has no say in clipping"
+    trained.step(_gradients(trained.parameters, 1), th.zeros(()))
     assert th.equal(parameters[0], before[0])
     assert (parameters[1] - before[1]).abs().min() > 1e-3
     parameters[0].requires_grad_(True)

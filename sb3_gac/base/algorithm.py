@@ -1,0 +1,279 @@
+"""What algorithms share, on- and off-policy: networks and their files, coefficients, frozen teachers."""
+
+from collections import deque
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any, ClassVar
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from sb3_gac.base.arguments import ConstructorArguments, present_names
+from sb3_gac.base.faults import FaultTolerance
+from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
+from sb3_gac.base.hooks import EpisodeHooks
+from sb3_gac.base.overrides import algorithm_of
+from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
+from sb3_gac.base.resuming import ResumableAlgorithm
+from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_rnn_types, resolve_role_keys
+from sb3_gac.base.strict_predict import DeploymentGuard
+from sb3_gac.base.update import GradientSteps
+from sb3_gac.checks.arguments import (
+    COMMON_CHECKS,
+    KEPT_AS,
+    ArgumentCheck,
+    PlainSchedule,
+    check_arguments,
+    make_arguments_plain,
+)
+from sb3_gac.checks.values import plain
+from sb3_gac.networks.heads import check_action_space
+from sb3_gac.optim.coefficients import Coefficient, DualVariable
+from sb3_gac.optim.compile import check_can_compile
+from sb3_gac.optim.parallel import has_side_effects
+
+
+class AsymmetricAlgorithm(
+    ConstructorArguments, DeploymentGuard, ResumableAlgorithm, FaultTolerance, EpisodeHooks, GradientSteps
+):
+    """
+    Base of all algorithms, beside SB3's ``OffPolicyAlgorithm`` or ``OnPolicyAlgorithm``: each ancestor adds one ability to
+    either, and reads nothing of the others but what it declares.
+
+    ``argument_checks`` says what each argument may be, ``_check_arguments`` what depends on others.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
+    #: Argument -> what raises a ValueError unless it is allowed; a subclass writes its own, its ancestors' count as well
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = COMMON_CHECKS
+    #: Arguments that files hold results of: given to ``load`` or ``resume``, they count once those are restored
+    restored_arguments: ClassVar[tuple[str, ...]] = ("lr_scales", "stats_window_size")
+    #: Arguments that are models, or their paths, and that training asks for their policies, see :attr:`frozen`
+    frozen_arguments: ClassVar[tuple[str, ...]] = ()
+    #: Name of such an argument -> its policy, from the first ``learn`` on
+    frozen: dict[str, FrozenPolicy]
+    policy_class: type[AsymmetricPolicy]
+    policy: AsymmetricPolicy
+    lr_scales: Mapping[str, float] | None
+    role_keys: RoleKeys | None
+
+    # --- set-up -----------------------------------------------------------------------------------------------------
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(
+                f'policy must be one of {list(self.policy_aliases)} or a policy class, got "{policy_name}": '
+                f'{type(self).__name__} works on Dict observations, for which SB3\'s name is "MultiInputPolicy".'
+            )
+        return self.policy_aliases[policy_name]
+
+    def _setup_lr_schedule(self) -> None:
+        self.lr_schedule = PlainSchedule(self.learning_rate)
+
+    def _setup_model(self) -> None:
+        make_arguments_plain(self)
+        self._check_arguments()
+        self.algorithm = algorithm_of(type(self))  # so that a file says whose it is
+        self.algorithm_path = f"{type(self).__module__}:{type(self).__qualname__}"
+        as_given = {"policy_kwargs": self.policy_kwargs, **self._prepare_data()}
+        self.policy_kwargs = self._all_policy_kwargs()
+        try:
+            super()._setup_model()  # type: ignore[safe-super]
+        finally:
+            self.__dict__.update(as_given)  # saved as the user gave them
+        side_effects = has_side_effects(self.policy)
+        self._branches_are_independent = self.device.type == "cpu" and bool(self.policy.side_branch) and not side_effects
+        if self.compile:
+            self._check_can_compile(side_effects)
+        self.coefficients = self.make_coefficients()
+        self._keep_coefficients()
+        self.programs = {}
+        self._behaviour_state: BehaviourState = None
+        self.frozen = {}
+        if self.env is not None:  # to act takes no teacher
+            self._load_frozen(needed=False)
+
+    def _prepare_data(self) -> dict[str, Any]:
+        """
+        Before SB3's set-up: make what holds the data.
+
+        :return: attributes that are others until that is done, as they were given
+        """
+        return {}
+
+    @property
+    def is_recurrent(self) -> bool:
+        """Whether a network has a memory, so that training takes sequences."""
+        rnn_type = (self.policy_kwargs or {}).get("rnn_type") or self.policy_class.default_rnn_type
+        return any(resolve_rnn_types(self.policy_class.roles, rnn_type).values())
+
+    def _check_can_compile(self, side_effects: bool) -> None:
+        if side_effects:
+            raise ValueError("compile=True can't do dropout or batch normalisation: leave them out, or leave it False.")
+        check_can_compile()
+        for name, network in self.policy.trained.items():
+            if not network.can_be_compiled:
+                raise ValueError(
+                    "compile=True can do torch's Adam and AdamW, without amsgrad, foreach or fused=False, but the optimiser "
+                    f"of {name} is {type(network.optimizer).__name__}: choose another optimizer_class, or leave compile False."
+                )
+
+    def _check_arguments(self) -> None:
+        """
+        :raises ValueError: naming the argument and the remedy
+        """
+        if not (isinstance(self.policy_class, type) and issubclass(self.policy_class, AsymmetricPolicy)):
+            names = list(self.policy_aliases)
+            raise ValueError(f"policy must be one of {names} or a subclass of their classes, got {self.policy_class!r}.")
+        if not hasattr(self, "observation_space"):
+            raise ValueError("env must be an environment, got None: load() alone can do without.")
+        check_action_space(type(self).__name__, self.action_space)
+        check_arguments(self)
+        resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
+        resolve_lr_scales(self.policy_class.roles, self.lr_scales)
+
+    def _all_policy_kwargs(self) -> dict[str, Any]:
+        return {**self._policy_options(), **present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")}
+
+    def _policy_options(self) -> dict[str, Any]:
+        """Arguments of the policy class that are arguments of the algorithm."""
+        return {"role_keys": self.role_keys, "lr_scales": self.lr_scales}
+
+    def make_coefficients(self) -> dict[str, Coefficient]:
+        """Name -> what a loss multiplies one of its terms with."""
+        return {}
+
+    def _keep_coefficients(self) -> None:
+        """Under the names that files know them by."""
+        for name, coefficient in self.coefficients.items():
+            setattr(self, f"{name}_dual", coefficient)
+
+    # --- SB3's names ------------------------------------------------------------------------------------------------
+
+    @property
+    def actor(self) -> th.nn.Module:
+        """The deployed policy; called, it returns actions."""
+        return self.policy.actor  # type: ignore[return-value]
+
+    @property
+    def critic(self) -> th.nn.Module:
+        """The critics that the deployed policy climbs."""
+        return self.policy.critic  # type: ignore[return-value]
+
+    @property
+    def critic_target(self) -> th.nn.Module:
+        """Target of :attr:`critic`."""
+        return self.policy.critic_target  # type: ignore[return-value]
+
+    @property
+    def log_ent_coef(self) -> th.Tensor | None:
+        """Logarithm of a learned entropy temperature; ``None`` if it is fixed, or there is none."""
+        temperature = self.coefficients.get("ent_coef")
+        return temperature.log_value if isinstance(temperature, DualVariable) else None
+
+    @property
+    def ent_coef_tensor(self) -> th.Tensor:
+        """The entropy temperature."""
+        return self.coefficients["ent_coef"].value
+
+    @property
+    def ent_coef_optimizer(self) -> th.optim.Optimizer | None:
+        """Optimiser of a learned entropy temperature; ``None`` if it is fixed, or there is none."""
+        temperature = self.coefficients.get("ent_coef")
+        return None if temperature is None else temperature.optimizer
+
+    def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:
+        """Optimisers that follow ``learning_rate``."""
+        optimizers = [getattr(self.policy, name).optimizer for name in self.policy.trained]
+        temperature = self.coefficients.get("ent_coef")
+        return optimizers if temperature is None or temperature.optimizer is None else [*optimizers, temperature.optimizer]
+
+    # --- teachers ---------------------------------------------------------------------------------------------------
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        self._load_frozen(needed=True)
+        return result
+
+    def _load_frozen(self, needed: bool) -> None:
+        """
+        :param needed: whether training is about to begin
+        :raises ValueError: if one is not there that is needed, or was trained on other spaces
+        """
+        assert isinstance(self.observation_space, spaces.Dict)
+        for name in set(self.frozen_arguments) - set(self.frozen):
+            source = getattr(self, name)
+            if source is not None:
+                self.frozen[name] = load_frozen_policy(source, self.observation_space, self.action_space, self.device, name)
+            elif needed:
+                raise ValueError(
+                    f"{type(self).__name__} trains with a {name}: pass {name}=<a trained model or its path>, to load() and "
+                    "resume() as well."
+                )
+
+    # --- save and load ----------------------------------------------------------------------------------------------
+
+    def get_parameters(self) -> dict[str, dict]:
+        """See SB3's ``get_parameters``: optimisers' options are Python's numbers, whatever a schedule or a callback left."""
+        self.policy.refresh_parameters()
+        parameters = super().get_parameters()
+        for name, state in parameters.items():
+            if "optim" in name:
+                state["param_groups"] = plain(state["param_groups"], arrays=True)
+        return parameters
+
+    def set_parameters(
+        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """See SB3's ``set_parameters``; optimisers' state of earlier versions becomes that of present ones."""
+        parameters = load_path_or_dict
+        if not isinstance(parameters, dict):
+            _, parameters, _ = load_from_zip_file(parameters, device=device, load_data=False)
+        parameters = dict(parameters)
+        for role, network in self.policy.trained.items():
+            name = f"policy.{role}.optimizer"
+            if name in parameters:
+                parameters[name] = network.in_present_layout(parameters[name])
+        super().set_parameters(parameters, exact_match, device)
+
+    def _change_arguments(self, given: dict[str, Any]) -> None:
+        """
+        :param given: some of ``restored_arguments``; they take the place of what was restored. A coefficient that is learned
+            before and after goes on from where it was, unless it is given a start value
+        """
+        if not given:
+            return
+        before = {name: (getattr(self, name, None), coefficient) for name, coefficient in self.coefficients.items()}
+        vars(self).update({KEPT_AS.get(name, name): value for name, value in given.items()})
+        make_arguments_plain(self)
+        self._check_arguments()
+        self.coefficients = self.make_coefficients()
+        for name, (spec, coefficient) in before.items():
+            spec_now = getattr(self, name, None)
+            if not any(other.startswith(name) for other in given):
+                self.coefficients[name] = coefficient
+            elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, DualVariable)):
+                self.coefficients[name].go_on_from(coefficient)
+        self._keep_coefficients()
+        if "lr_scales" in given:
+            self.policy.scale_learning_rates(self._all_policy_kwargs()["lr_scales"])
+        for buffer in ("ep_info_buffer", "ep_success_buffer"):
+            if getattr(self, buffer) is not None:
+                setattr(self, buffer, deque(getattr(self, buffer), maxlen=self._stats_window_size))
+
+    def _excluded_save_params(self) -> list[str]:
+        coefficients = [f"{name}_dual" for name in self.coefficients]
+        others = ["coefficients", "programs", "_program_key", "_worker", "frozen"]
+        others += [name for name in self.frozen_arguments if not isinstance(getattr(self, name), (str, PathLike))]
+        return [*super()._excluded_save_params(), *coefficients, *others]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", *(f"policy.{name}.optimizer" for name in self.policy.trained)]
+        tensors = []
+        for name, coefficient in self.coefficients.items():
+            of_optimizers, of_tensors = coefficient.state_names
+            state_dicts += [f"{name}_dual.{attribute}" for attribute in of_optimizers]
+            tensors += [f"{name}_dual.{attribute}" for attribute in of_tensors]
+        return state_dicts, tensors

@@ -1,0 +1,226 @@
+"""Collecting rollouts: every step that was taken is stored and none is invented, whoever stops, interrupts or interferes."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+Self = TypeVar("Self", bound="RolloutCollection")
+#: Of a rollout buffer, what is filled step by step, besides observations
+_FILLED = ("actions", "rewards", "episode_starts", "values", "log_probs")
+
+
+class UnrolledBuffer(DictRolloutBuffer):
+    """
+    SB3's buffer of rollouts, whose advantages may look ahead no further than the end of an unroll.
+
+    :param unroll_length: steps, after each of which an advantage bootstraps; ``None`` for the whole rollout
+    :param args: of ``DictRolloutBuffer``
+    :param kwargs: of ``DictRolloutBuffer``
+    """
+
+    def __init__(self, *args: Any, unroll_length: int | None = None, **kwargs: Any):
+        self.unroll_length = unroll_length
+        super().__init__(*args, **kwargs)
+
+    def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
+        """
+        Generalised advantage estimation; it is cut where an episode ends and where an unroll ends.
+
+        :param last_values: of the observations behind the last step, shape (n_envs,)
+        :param dones: whether an episode ended with the last step, shape (n_envs,)
+        """
+        next_values = np.concatenate([self.values[1:], last_values.detach().cpu().numpy().reshape(1, -1)])
+        goes_on = 1.0 - np.concatenate([self.episode_starts[1:], np.asarray(dones, dtype=np.float32).reshape(1, -1)])
+        deltas = self.rewards + self.gamma * next_values * goes_on - self.values
+        traces = self.gamma * self.gae_lambda * goes_on
+        if self.unroll_length is not None:
+            traces[self.unroll_length - 1 :: self.unroll_length] = 0.0
+        advantage = np.zeros_like(deltas[0])
+        for step in reversed(range(self.buffer_size)):
+            advantage = self.advantages[step] = deltas[step] + traces[step] * advantage
+        self.returns = self.advantages + self.values
+
+
+class RolloutCollection(OnPolicyAlgorithm):
+    """
+    SB3's loop in another order: a step is stored before callbacks see it, and a rollout that was ended by one is gone on
+    with by the next ``learn(..., reset_num_timesteps=False)``: together they do what one would have done.
+    """
+
+    #: Attributes that collecting changes
+    collected = ("_obs_after_last_step",)
+    #: What followed the last step that was stored, if its episode may still bootstrap from it
+    _obs_after_last_step: dict[str, np.ndarray] | None = None
+    reward_scale: float
+    unroll_length: int | None
+    rollout_buffer: UnrolledBuffer
+    _returns_so_far: Any
+    note_use: Callable[[], None]
+    reset_if_used_elsewhere: Callable[[VecEnv], None]
+    call_hooks: Callable[[np.ndarray], None]
+
+    def _setup_model(self) -> None:
+        """As SB3's, which would hand ``use_sde`` to the policy."""
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self._make_rollout_buffer()
+        self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)  # type: ignore
+        self.policy = self.policy.to(self.device)
+
+    # --- what others ask of the data ----------------------------------------------------------------------------------
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """See SB3's ``set_env``; the number of environments may be another one, between two rollouts."""
+        assert isinstance(env, VecEnv)
+        if env.num_envs != self.n_envs:
+            self.n_envs, self._last_obs, self._obs_after_last_step = env.num_envs, None, None
+            self._make_rollout_buffer()
+        super().set_env(env, force_reset)
+
+    def cut_episodes(self) -> None:
+        """The environments are about to be reset: the last step of the rollout under way bootstraps, as at a time limit."""
+        buffer = self.rollout_buffer
+        if self._obs_after_last_step is not None and buffer.pos > 0 and not buffer.generator_ready:
+            going_on = ~np.asarray(self._last_episode_starts)
+            buffer.rewards[buffer.pos - 1] += going_on * self.gamma * self._values_of(self._obs_after_last_step)
+        self._obs_after_last_step = None
+
+    def keep_first_observations(self) -> None:
+        """The environments were just reset."""
+
+    def save_data(self, root: Path) -> tuple[dict[str, Any], list[str]]:
+        """The rollout under way, as far as it goes; of one that was trained on, nothing."""
+        buffer = self.rollout_buffer
+        if buffer.generator_ready:
+            return {}, []
+        filled = {name: getattr(buffer, name)[: buffer.pos] for name in _FILLED}
+        return {**filled, "observations": {key: entry[: buffer.pos] for key, entry in buffer.observations.items()}}, []
+
+    def restore_data(self, root: Path, saved: dict[str, Any]) -> None:
+        """The rollout under way, as it was."""
+        if not saved:
+            return
+        buffer = self.rollout_buffer
+        buffer.pos = len(saved["rewards"])
+        buffer.full = buffer.pos == buffer.buffer_size
+        for name in _FILLED:
+            getattr(buffer, name)[: buffer.pos] = saved[name]
+        for key, entry in saved["observations"].items():
+            buffer.observations[key][: buffer.pos] = entry
+
+    def example_of_data(self) -> dict[str, th.Tensor]:
+        """A batch of observation entries and rewards as the networks see them, for the diagnosis of a divergence."""
+        buffer = self.rollout_buffer
+        entries = {**buffer.observations, "reward": buffer.rewards}
+        return {name: th.as_tensor(values[: buffer.buffer_size]) for name, values in entries.items()}
+
+    def _make_rollout_buffer(self) -> None:
+        self.rollout_buffer = UnrolledBuffer(
+            self.n_steps,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            gamma=self.gamma,
+            gae_lambda=self.gae_lambda,
+            n_envs=self.n_envs,
+            unroll_length=self.unroll_length,
+        )
+
+    # --- steps --------------------------------------------------------------------------------------------------------
+
+    def _setup_learn(self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any) -> Any:
+        if reset_num_timesteps:
+            self.rollout_buffer.reset()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """See SB3's ``collect_rollouts``; callbacks find the same names in ``locals``."""
+        self.policy.set_training_mode(False)
+        if self.rollout_buffer.generator_ready:  # it has been trained on
+            self.rollout_buffer.reset()
+        callback.on_rollout_start()
+        dones = np.asarray(self._last_episode_starts)
+        while self.rollout_buffer.pos < n_rollout_steps:
+            env, rollout_buffer = self.env, self.rollout_buffer  # type: ignore[assignment]  # a callback may set others
+            self.reset_if_used_elsewhere(env)
+            drawn, actions, values, log_probs = self._act()
+            new_obs, rewards, dones, infos = env.step(actions)
+            self.note_use()
+            self._returns_so_far += self._vec_normalize_env.get_original_reward() if self._vec_normalize_env else rewards
+            rewards = self._with_value_of_what_was_cut(rewards * self.reward_scale, dones, infos)
+            rollout_buffer.add(self._last_obs, drawn, rewards, self._last_episode_starts, values, log_probs)  # type: ignore
+            self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
+            self._obs_after_last_step = new_obs  # type: ignore[assignment]
+            self.num_timesteps += env.num_envs
+            self._update_info_buffer(infos, dones)
+            self.call_hooks(dones)
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+        last_values = th.as_tensor(self._values_of(self._last_obs))  # type: ignore[arg-type]
+        self.rollout_buffer.compute_returns_and_advantage(last_values, dones)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    @th.no_grad()
+    def _act(self) -> tuple[np.ndarray, np.ndarray, th.Tensor, th.Tensor]:
+        """
+        The behaviour policy's.
+
+        :return: what was drawn of its distribution, for the buffer; actions for the environments; values and
+            log-probabilities
+        """
+        obs, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
+        distribution = self.policy.behaviour_distribution(obs)  # type: ignore[operator]
+        drawn = distribution.draw()
+        actions = distribution.action(drawn).cpu().numpy()
+        if isinstance(self.action_space, spaces.Box):
+            actions = self.policy.unscale_action(actions.reshape(-1, *self.action_space.shape))
+        return drawn.cpu().numpy(), actions, self.policy.critic(obs), distribution.log_prob(drawn)  # type: ignore[operator]
+
+    def _with_value_of_what_was_cut(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
+        """
+        :param rewards: shape (n_envs,)
+        :param dones: shape (n_envs,)
+        :param infos: of the environments
+        :return: with the discounted value of the last observation, where a time limit has ended an episode
+        """
+        for index in np.flatnonzero(dones).tolist():
+            if infos[index].get("TimeLimit.truncated", False):
+                last = {key: value[None] for key, value in infos[index]["terminal_observation"].items()}
+                rewards[index] += self.gamma * self._values_of(last)[0]
+        return rewards
+
+    @th.no_grad()
+    def _values_of(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """
+        :param observation: B of each entry
+        :return: shape (B,)
+        """
+        obs, _ = self.policy.obs_to_tensor(observation)
+        return self.policy.critic(obs).cpu().numpy()  # type: ignore[operator]
+
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """See SB3's ``OnPolicyAlgorithm.learn``; TensorBoard's runs are named after the class by default."""
+        tb_log_name = tb_log_name or type(self).__name__
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
