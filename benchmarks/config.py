@@ -2,7 +2,7 @@
 What a run trains with: layers of YAML, the later over the earlier, checked against the algorithm's own signature.
 
 In order: the preset's arguments, those of the task, those of the task at that noise (each first for ``all`` algorithms, then
-for the classes from which the algorithm descends), the suite's overrides, the algorithm's own.
+for the families and classes from which the algorithm descends), the suite's overrides, the algorithm's own.
 """
 
 import warnings
@@ -76,7 +76,7 @@ def try_out(where: str, spec: RunSpec) -> None:
         try:
             if spec.needs is None:
                 kind, arguments = resolve(spec)
-                small = {"buffer_size": 1_000, "learning_starts": 10**9}
+                small = {"buffer_size": 1_000, "learning_starts": 10**9, "n_epochs": 1}
                 known = constructor_parameters(kind)
                 arguments |= {name: value for name, value in small.items() if name in known}
                 model = kind(env=env, device="cpu", **{"policy": POLICY, **instantiate(arguments), "seed": spec.seed})

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
     from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
-    from sb3_gac.baselines.gpo import GPO, GPOPenalty
+    from sb3_gac.baselines.gpo import GPOClip, GPOPenalty
     from sb3_gac.baselines.tgrl import TGRL
     from sb3_gac.checkpoint.files import CheckpointError
     from sb3_gac.checks.divergence import DivergenceError
@@ -75,7 +75,6 @@ def __dir__() -> list[str]:
 
 __all__ = [
     "GAC",
-    "GPO",
     "PRESETS",
     "TGRL",
     "AsymmetricSAC",
@@ -89,6 +88,7 @@ __all__ = [
     "GACPolicy",
     "GACShare",
     "GACWithoutQ",
+    "GPOClip",
     "GPOPenalty",
     "GuiderLearnerEvalCallback",
     "InvalidStepError",

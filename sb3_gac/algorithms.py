@@ -10,10 +10,16 @@ ALGORITHMS = {
     "gac_without_q": "sb3_gac.gac.ablations:GACWithoutQ",
     "asymmetric_sac": "sb3_gac.baselines.asymmetric_sac:AsymmetricSAC",
     "tgrl": "sb3_gac.baselines.tgrl:TGRL",
-    "gpo_clip": "sb3_gac.baselines.gpo:GPO",
+    "gpo_clip": "sb3_gac.baselines.gpo:GPOClip",
     "gpo_penalty": "sb3_gac.baselines.gpo:GPOPenalty",
 }
-_NAMES = {path: name for name, path in ALGORITHMS.items()}
+#: Families of algorithms, by which presets know what they share
+FAMILIES = {
+    "off_policy": "stable_baselines3.common.off_policy_algorithm:OffPolicyAlgorithm",
+    "on_policy": "stable_baselines3.common.on_policy_algorithm:OnPolicyAlgorithm",
+    "gpo": "sb3_gac.baselines.gpo:GPO",
+}
+_NAMES = {path: name for name, path in {**ALGORITHMS, **FAMILIES}.items()}
 
 
 def import_path(path: str) -> Any:
@@ -50,7 +56,7 @@ def algorithm_class(name: str) -> type:
 def name_of(kind: type) -> str:
     """
     :param kind: a class
-    :return: its name in ``ALGORITHMS``, or else ``module:Class``
+    :return: its name in ``ALGORITHMS`` or ``FAMILIES``, or else ``module:Class``
     """
     path = f"{kind.__module__}:{kind.__qualname__}"
     return _NAMES.get(path, path)

@@ -72,10 +72,36 @@ def _suggest_shared(trial: optuna.Trial) -> dict[str, Any]:
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-3, 0.05, log=True),
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
         "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 9),
-        "tau": trial.suggest_float("tau", 1e-3, 0.05, log=True),
-        "target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"]),
         "net_arch": trial.suggest_categorical("net_arch", list(_NET_ARCHS)),
     }
+
+
+def _suggest_off_policy(trial: optuna.Trial) -> dict[str, Any]:
+    return {
+        "tau": trial.suggest_float("tau", 1e-3, 0.05, log=True),
+        "target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"]),
+    }
+
+
+def _suggest_on_policy(trial: optuna.Trial) -> dict[str, Any]:
+    return {
+        "n_epochs": trial.suggest_int("n_epochs", 2, 10),
+        "gae_lambda": trial.suggest_float("gae_lambda", 0.9, 0.99),
+        "clip_range": trial.suggest_categorical("clip_range", [0.1, 0.2, 0.3]),
+        "ent_coef": trial.suggest_float("ent_coef", 1e-4, 0.03, log=True),
+    }
+
+
+def _suggest_gpo(trial: optuna.Trial) -> dict[str, Any]:
+    return {"learner_rl_coef": trial.suggest_float("learner_rl_coef", 0.0, 3.0)}
+
+
+def _suggest_gpo_clip(trial: optuna.Trial) -> dict[str, Any]:
+    return {"delta": trial.suggest_float("delta", 0.05, 0.4)}
+
+
+def _suggest_gpo_penalty(trial: optuna.Trial) -> dict[str, Any]:
+    return {"target_kl": trial.suggest_float("target_kl", 3e-4, 0.1, log=True)}
 
 
 def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
@@ -87,8 +113,16 @@ def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
     }
 
 
-#: "all", or an algorithm, with its subclasses -> what it has to sample
-SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {"all": _suggest_shared, "gac": _suggest_guidance}
+#: "all", or a family or an algorithm, with its subclasses -> what it has to sample
+SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {
+    "all": _suggest_shared,
+    "off_policy": _suggest_off_policy,
+    "on_policy": _suggest_on_policy,
+    "gac": _suggest_guidance,
+    "gpo": _suggest_gpo,
+    "gpo_clip": _suggest_gpo_clip,
+    "gpo_penalty": _suggest_gpo_penalty,
+}
 
 
 def convert(sampled_params: dict[str, Any]) -> dict[str, Any]:

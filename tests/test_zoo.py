@@ -6,6 +6,7 @@ import sys
 
 import pytest
 import yaml
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 pytest.importorskip("rl_zoo3")
 
@@ -130,17 +131,20 @@ def test_every_algorithm_has_hyperparameters_that_it_takes_for_every_registered_
     assert {"default", "sb3_gac/Pendulum-v1"} == set(settings) - {f"sb3_gac/{task}-v5" for task in envs.suites.mujoco.TASKS}
     assert settings[ENV]["role_keys"] == {"critic": ["privileged"]}
     assert "role_keys" not in settings["default"], "elsewhere the privileged entry may not be the whole state"
-    shared = {"n_envs": 4, "n_timesteps": 100_000, "policy": "MultiInputPolicy", "batch_size": 128, "gradient_steps": -1}
+    kind = algorithm_class(algorithm)
+    off_policy = issubclass(kind, OffPolicyAlgorithm)
+    of_family = {"batch_size": 128, "gradient_steps": -1} if off_policy else {"batch_size": 256, "n_steps": 512}
+    shared = {"n_envs": 4, "n_timesteps": 100_000, "policy": "MultiInputPolicy"} | of_family
     assert shared.items() <= settings["default"].items()
     arguments = {key: value for key, value in settings[ENV].items() if key not in ("n_envs", "n_timesteps")}
-    algorithm_class(algorithm)(env=envs.make_mujoco("InvertedDoublePendulum"), **arguments | {"buffer_size": 10})
+    kind(env=envs.make_mujoco("InvertedDoublePendulum"), **arguments | ({"buffer_size": 10} if off_policy else {}))
 
 
 def test_every_argument_that_is_sampled_is_used():
     class Trial:
         """Gives the lower end of what it is asked for, or the first choice."""
 
-        def suggest_float(self, name, low, high, log):
+        def suggest_float(self, name, low, high, log=False):
             return low
 
         suggest_int = staticmethod(lambda name, low, high: low)
@@ -152,3 +156,8 @@ def test_every_argument_that_is_sampled_is_used():
     assert set(of_gac) == shared | {"target_kl", "kl_coef_learning_rate"}
     assert set(of_share) == set(of_gac), "as a subclass of GAC"
     assert (of_gac["gamma"], of_gac["batch_size"], of_gac["target_kl"]) == (0.999, 64, 3e-4)
+    of_clip, of_penalty = (set(sample(name, Trial(), 1, 1, {})) for name in ("gpo_clip", "gpo_penalty"))
+    assert of_clip - of_penalty == {"delta"}
+    assert of_penalty - of_clip == {"target_kl"}
+    on_policy = (shared - {"tau", "target_entropy"}) | {"n_epochs", "gae_lambda", "clip_range", "ent_coef", "learner_rl_coef"}
+    assert of_clip & of_penalty == on_policy

@@ -239,7 +239,7 @@ class GradientSteps(BaseAlgorithm):
         if not self._in_several_programs:
             return run(batch)
         with th.no_grad():
-            return self._compiled(role, run, batch)
+            return self._compiled(("outputs", role), run, batch)
 
     def now(self, role: str, outputs: Outputs, batch: Batch) -> Any:
         """

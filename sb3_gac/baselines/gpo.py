@@ -1,6 +1,7 @@
 """Guided Policy Optimization: on-policy; a guider that sees everything acts, and one network is both policies."""
 
 import math
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -126,21 +127,19 @@ class GPOPolicy(AsymmetricPolicy):
 
 class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
     """
-    GPO-clip: PPO for a guider that sees everything and whose ratio to the learner is clipped; the learner imitates it and
-    climbs the same advantages (Li & Xie 2025, "Guided Policy Optimization under Partial Observability"). ``predict`` is the
-    learner.
+    What both forms share: PPO for a guider that sees everything; a learner that imitates it and climbs the same advantages
+    (Li & Xie 2025, "Guided Policy Optimization under Partial Observability"). ``predict`` is the learner.
 
     In all objectives ``guider`` and ``learner`` are the policies at a minibatch's observations. For observations of different
     sizes use ``VecNormalize(env, norm_reward=False, clip_obs=5.0)``, as the authors do. Arguments that are not described here
     are those of :class:`AsymmetricOnPolicyAlgorithm`.
 
-    :param delta: how far the guider's probability of an action may be from the learner's, as a share of it
     :param learner_rl_coef: weight of the learner's own PPO objective beside its imitation of the guider
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": GPOPolicy}
-    argument_checks: ClassVar[Mapping[str, Any]] = {"delta": check_inner_fraction, "learner_rl_coef": check_not_negative}
-    compiled_settings = (*AsymmetricOnPolicyAlgorithm.compiled_settings, "delta", "learner_rl_coef")
+    argument_checks: ClassVar[Mapping[str, Any]] = {"learner_rl_coef": check_not_negative}
+    compiled_settings = (*AsymmetricOnPolicyAlgorithm.compiled_settings, "learner_rl_coef")
     policy: GPOPolicy  # type: ignore[assignment]
 
     def __init__(
@@ -148,11 +147,9 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
         policy: str | type[GPOPolicy],
         env: GymEnv | str | None,
         *sb3: Any,
-        delta: float = 0.1,
         learner_rl_coef: float = 2.0,
         **shared: Unpack[OnPolicyArguments],
     ):
-        self.delta = delta
         self.learner_rl_coef = learner_rl_coef
         super().__init__(policy, env, *sb3, **shared)
 
@@ -185,6 +182,50 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
         parts = {"guider_loss": guider_loss, "imitation_loss": learner_loss, "critic_loss": value_loss}
         return Loss(loss, {**parts, "entropy": entropy, "kl": kl})
 
+    @abstractmethod
+    def guider_objective(
+        self,
+        batch: DictRolloutBufferSamples,
+        guider: Any,
+        learner: Any,
+        advantages: th.Tensor,
+        epsilon: th.Tensor,
+        coefficients: Mapping[str, th.Tensor],
+    ) -> th.Tensor:
+        """
+        :param batch: B transitions
+        :param guider: with its gradient, shapes (B, A)
+        :param learner: as a constant, shapes (B, A)
+        :param advantages: shape (B,)
+        :param epsilon: how far a ratio may count
+        :param coefficients: by name
+        :return: what the guider minimises, scalar
+        """
+
+    def learner_objective(
+        self, batch: DictRolloutBufferSamples, guider: Any, learner: Any, advantages: th.Tensor, epsilon: th.Tensor
+    ) -> th.Tensor:
+        """Imitate the guider, and climb its advantages."""
+        log_ratio = (learner.log_prob(batch.actions) - batch.old_log_prob).clamp(max=LARGEST_LOG_RATIO)
+        imitation = guider.kl(learner, "mean").mean()
+        return imitation + self.learner_rl_coef * clipped_surrogate(log_ratio, advantages, epsilon)
+
+
+class GPOClip(GPO):
+    """
+    GPO-clip: the guider's ratio to the learner is clipped before PPO's own, and a KL brings it back where it has left the
+    learner's vicinity. Arguments that are not described here are those of :class:`GPO`.
+
+    :param delta: how far the guider's probability of an action may be from the learner's, as a share of it
+    """
+
+    argument_checks: ClassVar[Mapping[str, Any]] = {"delta": check_inner_fraction}
+    compiled_settings = (*GPO.compiled_settings, "delta")
+
+    def __init__(self, policy: str | type[GPOPolicy], env: GymEnv | str | None, *sb3: Any, delta: float = 0.1, **shared: Any):
+        self.delta = delta
+        super().__init__(policy, env, *sb3, **shared)
+
     def guider_objective(
         self,
         batch: DictRolloutBufferSamples,
@@ -203,14 +244,6 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
         )
         has_left = (log_distance != nearby).float()
         return surrogate + (has_left * guider.kl(learner, "mean")).mean()
-
-    def learner_objective(
-        self, batch: DictRolloutBufferSamples, guider: Any, learner: Any, advantages: th.Tensor, epsilon: th.Tensor
-    ) -> th.Tensor:
-        """Imitate the guider, and climb its advantages."""
-        log_ratio = (learner.log_prob(batch.actions) - batch.old_log_prob).clamp(max=LARGEST_LOG_RATIO)
-        imitation = guider.kl(learner, "mean").mean()
-        return imitation + self.learner_rl_coef * clipped_surrogate(log_ratio, advantages, epsilon)
 
 
 class GPOPenalty(GPO):

@@ -5,8 +5,9 @@ Each is a YAML file beside this one, and read by everybody: by :func:`preset`, t
 
     run: {envs: 4}                  # environments side by side that it is meant for; and, if it says so, steps
     arguments:
-      all: {batch_size: 128}        # of every algorithm
-      gac: {target_kl: 0.01}        # of that one and its subclasses alone, over those of all
+      all: {gamma: 0.99}            # of every algorithm
+      off_policy: {batch_size: 128} # of those of a family, over those of all
+      gac: {target_kl: 0.01}        # of that one and its subclasses alone, over the above
     tasks:                          # the same again, over the above: for a task, and for that task at a noise level
       Ant: {arguments: {gac: {target_kl: 0.005}}, noises: {0.3: {gac: {target_kl: 0.001}}}}
 
@@ -22,7 +23,7 @@ from typing import Any
 import yaml
 from torch import nn, optim
 
-from sb3_gac.algorithms import ALGORITHMS, algorithm_class, name_of
+from sb3_gac.algorithms import ALGORITHMS, FAMILIES, algorithm_class, name_of
 
 DIRECTORY = Path(__file__).parent
 _ALIASES = {"paper": "paper-brax"}
@@ -90,7 +91,7 @@ def read_preset(name: str) -> Preset:
 
 def _check_sections(where: str, sections: Any) -> None:
     foreign = {name for name in sections if ":" in str(name)} if isinstance(sections, Mapping) else set()
-    _check(where, sections, {"all", *ALGORITHMS, *foreign})
+    _check(where, sections, {"all", *FAMILIES, *ALGORITHMS, *foreign})
     for name, arguments in sections.items():
         _check(f"{where}, {name}", arguments, set(arguments) if isinstance(arguments, Mapping) else set())
 

@@ -11,17 +11,17 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
-from sb3_gac import GPO, GPOPenalty, InvalidStepError, OnnxPolicy, export_learner
+from sb3_gac import GPOClip, GPOPenalty, InvalidStepError, OnnxPolicy, export_learner
 from sb3_gac.base.rollouts import UnrolledBuffer
 from sb3_gac.math.losses import clipped_surrogate
 from sb3_gac.optim.coefficients import MultiplicativeCoefficient
 from tests.helpers import TwoViewBandit, TwoViewChoice
 
-BOTH = [GPO, GPOPenalty]
+BOTH = [GPOClip, GPOPenalty]
 OF_POLICY = {"net_arch": [8, 8], "activation_fn": nn.SiLU}
 
 
-def make_model(env=None, cls=GPO, **arguments):
+def make_model(env=None, cls=GPOClip, **arguments):
     arguments = {"n_steps": 16, "batch_size": 8, "n_epochs": 2, "learning_rate": 3e-3, "policy_kwargs": OF_POLICY} | arguments
     return cls("MultiInputPolicy", TwoViewBandit(length=3) if env is None else env, seed=0, device="cpu", **arguments)
 
@@ -202,7 +202,7 @@ def test_where_both_policies_see_the_same_it_is_ppo_step_for_step():
     arguments = {"learning_rate": 3e-3, "n_steps": 32, "batch_size": 16, "n_epochs": 3, "seed": 0, "device": "cpu"}
     one_view = {"role_keys": {"guider": ["partial"], "critic": ["partial"]}}
     options = {"optimizer_kwargs": {"eps": 1e-5}, **OF_POLICY}
-    model = GPO(
+    model = GPOClip(
         "MultiInputPolicy",
         env,
         clip_range=0.2,
@@ -380,7 +380,7 @@ def test_observations_may_be_normalised(tmp_path):
     whole = make_model(make_env()).learn(64)
     part = make_model(make_env()).learn(32)
     part.save_checkpoint(tmp_path)
-    again = GPO.resume(tmp_path, make_env(), device="cpu").learn(32, reset_num_timesteps=False)
+    again = GPOClip.resume(tmp_path, make_env(), device="cpu").learn(32, reset_num_timesteps=False)
     assert _same(whole, again)
     assert again.trained_normalised
 
@@ -402,7 +402,7 @@ def test_other_environments_in_another_number():
         ({"n_steps": 17}, "leaves a minibatch of one of the 17 transitions"),
         ({"unroll_length": 0}, "unroll_length must be"),
         ({"clip_range": -0.1}, "clip_range must be"),
-        ({"policy_kwargs": {"rnn_type": "gru"}}, "GPO has no form with a memory"),
+        ({"policy_kwargs": {"rnn_type": "gru"}}, "GPOClip has no form with a memory"),
         ({"policy_kwargs": {"net_arch": []}}, "net_arch must have a hidden layer"),
         ({"role_keys": {"guider": ["privileged"]}}, "guider.*lacks"),
     ],
@@ -413,7 +413,7 @@ def test_what_can_not_be_is_refused(arguments, message):
 
 
 def test_what_is_no_argument_is_refused():
-    with pytest.raises(TypeError, match='GPO\\(\\) got "tau", which is no argument of GPO'):
+    with pytest.raises(TypeError, match='GPOClip\\(\\) got "tau", which is no argument of GPOClip'):
         make_model(tau=0.1)
 
 

@@ -81,7 +81,7 @@ KINDS = {
 
 @pytest.mark.parametrize(("kind", "threads"), [*((kind, 1) for kind in KINDS), ("discrete", 2), ("guider's std, pulled", 2)])
 def test_every_kind_is_compiled_to_what_it_is(kind, threads):
-    """On one thread as one program; on two, branches are programs of their own, and run at once."""
+    """On one thread as one program; on two, steps are programs of their own, and those of a branch run beside the other's."""
     before = th.get_num_threads()
     th.set_num_threads(threads)
     try:
@@ -89,8 +89,8 @@ def test_every_kind_is_compiled_to_what_it_is(kind, threads):
         _train((plain, compiled))
         names = {key[0] for key in compiled.programs}
         branches = threads > 1 and isinstance(compiled, GAC)
-        of_branches = {"guider", "learner", ("guider_critic", "guider"), ("learner_critic", "learner")}
-        assert names == (of_branches if branches else {"update"})
+        of_steps = {("outputs", role) for role in ("guider", "learner")} | {*compiled.policy.roles.all}
+        assert names == (of_steps if branches else {"update"})
     finally:
         th.set_num_threads(before)
     _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
