@@ -178,7 +178,7 @@ def test_a_gradient_step_is_that_of_the_papers_one_network(cls):
     _apart(model)
     if cls is GPOPenalty:
         model.coefficients["kl_coef"].value.fill_(0.7)
-    plain = PlainGPO(model, delta=model.delta, kl_coef=0.7 if cls is GPOPenalty else None)
+    plain = PlainGPO(model, getattr(model, "delta", None), 0.7 if cls is GPOPenalty else None)
     batch = next(model.rollout_buffer.get(64))
     noise = th.randn(64, 1)
     coefficients = {name: coefficient.value for name, coefficient in model.coefficients.items()}
