@@ -11,8 +11,8 @@ from typing import Any
 
 from stable_baselines3.common.logger import Logger
 
-from benchmarks.environments import environment, make_envs
-from benchmarks.suite import RunSpec, check_keys, check_numbers, needed_runs, read_definitions, with_needed
+from benchmarks.environments import environment, make_envs, normalized
+from benchmarks.suite import RunSpec, check_is, check_keys, check_numbers, needed_runs, read_definitions, with_needed
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.base.arguments import present_names
 from sb3_gac.checks.arguments import constructor_parameters
@@ -39,7 +39,21 @@ def read_algorithm(name: str, definition: Mapping[str, Any] | None = None) -> tu
         kind = algorithm_class(str(definition["class"]))
     except ValueError as error:
         raise ValueError(f"algorithm {name}, class: {error}") from None
-    return kind, {key: value for key, value in definition.items() if key not in ("class", "needs")}
+    return kind, {key: value for key, value in definition.items() if key not in ("class", "needs", "normalize")}
+
+
+def normalization(spec: RunSpec) -> dict[str, Any] | None:
+    """
+    :param spec: of a run
+    :return: keyword arguments of the ``VecNormalize`` around its environments, ``normalize`` in the algorithm's definition;
+        ``None`` if there is none
+    :raises ValueError: if they are no mapping
+    """
+    definition = read_definitions()[spec.algorithm] if spec.definition is None else spec.definition
+    given = definition.get("normalize")
+    if given is not None:
+        check_is(f"algorithm {spec.algorithm}, normalize", given, "a mapping, such as {clip_obs: 5.0}", Mapping)
+    return given
 
 
 def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
@@ -56,6 +70,7 @@ def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
         try:
             environment(spec)
             resolve(spec)
+            normalization(spec)
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
     for spec in kinds.values():
@@ -72,7 +87,7 @@ def try_out(where: str, spec: RunSpec) -> None:
     :raises ValueError: with what went wrong
     """
     try:
-        env = make_envs(spec, min(spec.envs, 2), spec.seed)
+        env = normalized(make_envs(spec, min(spec.envs, 2), spec.seed), normalization(spec))
         try:
             if spec.needs is None:
                 kind, arguments = resolve(spec)

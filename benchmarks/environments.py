@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.suite import RunSpec
 from sb3_gac.algorithms import import_path
@@ -43,6 +43,15 @@ def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:
         return make_vec_env(env_id, n_envs, seed=seed, env_kwargs=kwargs)
     # What counts returns goes around the wrappers: one of them may change rewards, or end episodes
     return make_vec_env(partial(make_wrapped, env_id, kwargs, spec.environment["wrappers"]), n_envs, seed=seed)
+
+
+def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = True) -> VecEnv:
+    """
+    :param env: of a run
+    :param options: of ``VecNormalize``, which leaves rewards alone; ``None`` for no normalisation
+    :param training: whether it gathers statistics
+    """
+    return env if options is None else VecNormalize(env, **{"norm_reward": False, "training": training, **options})
 
 
 def make_wrapped(env_id: str, kwargs: Mapping[str, Any], wrappers: Sequence[Mapping[str, Mapping[str, Any]]]) -> gym.Env:

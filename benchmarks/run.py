@@ -25,16 +25,17 @@ import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_gac
 from benchmarks.checkpoint import checkpoints_of, locked, write_atomically
-from benchmarks.config import POLICY, in_present_names, resolve, settings_in_present_names
-from benchmarks.environments import make_envs
+from benchmarks.config import POLICY, in_present_names, normalization, resolve, settings_in_present_names
+from benchmarks.environments import make_envs, normalized
 from benchmarks.suite import HERE, RUNS, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.presets import instantiate
 
 EVAL_SEED = 10_000
-CONFIGURATION, MODEL = "config.yaml", "model.zip"
+CONFIGURATION, MODEL, STATISTICS = "config.yaml", "model.zip", "vecnormalize.pkl"
 
 
 def provenance() -> dict[str, Any]:
@@ -68,6 +69,8 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     with locked(directory):
         algorithm_class, arguments = resolve(spec)
         configuration = {"run": dataclasses.asdict(spec), "arguments": arguments}
+        if (options := normalization(spec)) is not None:
+            configuration["normalize"] = options
         _refuse_other_settings(directory / CONFIGURATION, algorithm_class, configuration)
         history = _train(spec, directory, algorithm_class, configuration, models, progress_bar)
         write_evaluations(history, directory / "evaluations.csv")
@@ -153,7 +156,9 @@ def _train(
     :param models: argument -> file of the model that it is
     :return: one row per evaluation
     """
-    env, eval_env = make_envs(spec, spec.envs, spec.seed), make_envs(spec, spec.eval_episodes)
+    options = configuration.get("normalize")
+    env = normalized(make_envs(spec, spec.envs, spec.seed), options)
+    eval_env = normalized(make_envs(spec, spec.eval_episodes), options, training=False)
     every = spec.eval_every // spec.envs
     evaluation = _evaluation_class(algorithm_class)(
         eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=spec.eval_episodes, verbose=0
@@ -172,6 +177,8 @@ def _train(
     left = spec.steps - model.num_timesteps
     model.learn(left, callback=callbacks, reset_num_timesteps=False, progress_bar=progress_bar)
     model.save(directory / MODEL)
+    if isinstance(env, VecNormalize):
+        env.save(str(directory / STATISTICS))
     stopwatch.write()
     return evaluation.history
 

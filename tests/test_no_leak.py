@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC, OnnxPolicy, export_learner
+from sb3_gac import GAC, TGRL, AsymmetricSAC, GPOClip, GPOPenalty, OnnxPolicy, export_learner
 from sb3_gac.envs import History
 from tests.helpers import Sampled, small_model
 
@@ -35,6 +35,11 @@ def _recurrent(cell, env, policy_kwargs=None, **arguments):
     options = {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8], **(policy_kwargs or {})}
     arguments |= {"learning_starts": 20, "batch_size": 4, "seed": 0, "device": "cpu"}
     return GAC(f"MultiInput{cell}Policy", env, policy_kwargs=options, **arguments)
+
+
+def _on_policy(env, policy_kwargs=None, cls=GPOClip):
+    options = {"net_arch": [8], **(policy_kwargs or {})}
+    return cls("MultiInputPolicy", env, n_steps=10, batch_size=10, seed=0, device="cpu", policy_kwargs=options)
 
 
 def _normalised():
@@ -58,6 +63,10 @@ KINDS = {
     "asymmetric SAC": lambda: small_model(Sampled(VECTORS), cls=AsymmetricSAC),
     "gru of the learner alone": lambda: _recurrent("", Sampled(VECTORS), {"rnn_type": {"learner": "gru"}}),
     "cnn of the learner alone": lambda: small_model(Sampled(IMAGES), policy_kwargs=CNN, role_keys=STATE),
+    "GPO": lambda: _on_policy(Sampled(VECTORS)),
+    "GPO, normalised": lambda: _on_policy(_normalised()),
+    "GPO, cnn, discrete": lambda: _on_policy(Sampled(IMAGES, CHOICE), CNN),
+    "GPO-penalty, shared encoder": lambda: _on_policy(Sampled(VECTORS), SHARED, GPOPenalty),
     "TGRL": lambda: small_model(Sampled(VECTORS), cls=TGRL, teacher=small_model(Sampled(VECTORS), cls=AsymmetricSAC)),
 }
 

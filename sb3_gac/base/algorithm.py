@@ -33,6 +33,7 @@ from sb3_gac.networks.heads import check_action_space
 from sb3_gac.optim.coefficients import Coefficient, DualVariable
 from sb3_gac.optim.compile import check_can_compile
 from sb3_gac.optim.parallel import has_side_effects
+from sb3_gac.replay.source import ReplaySource
 
 
 class AsymmetricAlgorithm(
@@ -166,6 +167,11 @@ class AsymmetricAlgorithm(
     def critic_target(self) -> th.nn.Module:
         """Target of :attr:`critic`."""
         return self.policy.critic_target  # type: ignore[return-value]
+
+    @property
+    def wrapper_outside_normalisation(self) -> Any:
+        """What changes observations after ``VecNormalize`` has normalised them; ``None`` if nothing does."""
+        return None if self.env is None else ReplaySource(self.env).in_the_way
 
     @property
     def log_ent_coef(self) -> th.Tensor | None:

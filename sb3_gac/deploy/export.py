@@ -16,7 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from torch import nn
 
-from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.checks.entries import computable
 from sb3_gac.checks.values import check_positive, index_bounds
 from sb3_gac.deploy.normalization import DeploymentNormalizer
@@ -104,7 +104,7 @@ class DeployedModule(nn.Module):
 
 
 def export_learner(
-    model: AsymmetricOffPolicyAlgorithm,
+    model: AsymmetricAlgorithm,
     path: str | Path,
     normalizer: DeploymentNormalizer | None = None,
     units: dict[str, str] | None = None,
@@ -141,7 +141,7 @@ def export_learner(
     return path
 
 
-def _normalizer_of(model: AsymmetricOffPolicyAlgorithm) -> DeploymentNormalizer | None:
+def _normalizer_of(model: AsymmetricAlgorithm) -> DeploymentNormalizer | None:
     vec_normalize = model.get_vec_normalize_env()
     if vec_normalize is None and model.trained_normalised:
         raise ValueError(
@@ -152,7 +152,7 @@ def _normalizer_of(model: AsymmetricOffPolicyAlgorithm) -> DeploymentNormalizer 
         return None
     keys = model.policy.role_keys[model.policy.roles.deployed]
     normalizer = DeploymentNormalizer.from_vec_normalize(vec_normalize, keys)
-    wrapper = model.replay_source.in_the_way
+    wrapper = model.wrapper_outside_normalisation
     if wrapper is not None and normalizer.mean:
         raise ValueError(
             f"{type(wrapper).__name__} stands outside VecNormalize: what the policy reads of {list(normalizer.mean)} is not "

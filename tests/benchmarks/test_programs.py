@@ -32,6 +32,7 @@ from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
 from benchmarks.suite import RunSpec, made_with, read_suite
 from sb3_gac import GAC, PRESETS, preset
+from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.presets import instantiate, read_preset
 from tests.helpers import small_model
 
@@ -471,8 +472,9 @@ def test_every_algorithm_fits_every_preset():
         for algorithm in algorithms if preset_name == "sb3" else algorithms - {"sb3-sac"}:
             algorithm_class, arguments = resolve(RunSpec(algorithm, "Ant", 0.1, 0, 1000, 4, preset_name, 500, 1))
             env = gym.make("sb3_gac/InvertedDoublePendulum-v5")
-            settings = {"policy": "MultiInputPolicy", **instantiate(arguments), "buffer_size": 1_000, "device": "cpu"}
-            algorithm_class(env=env, **settings)
+            settings = {"policy": "MultiInputPolicy", **instantiate(arguments), "device": "cpu"}
+            small = {"buffer_size": 1_000} if "buffer_size" in constructor_parameters(algorithm_class) else {}
+            algorithm_class(env=env, **settings | small)
 
 
 KILLS = 10  # of each program
@@ -529,13 +531,15 @@ class _Killed(Stopwatch):
         return super()._on_step()
 
 
-@pytest.mark.parametrize("algorithm", ["gac", "sac-asym", "sb3-sac"])
+@pytest.mark.parametrize("algorithm", ["gac", "sac-asym", "sb3-sac", "gpo-penalty"])
 def test_a_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch, algorithm):
     """Ours end as if they had never been interrupted, to the bit."""
     spec = replace(read_suite(SMOKE)[0], algorithm=algorithm)
     if algorithm == "sb3-sac":
         small = {"learning_starts": 100, "batch_size": 16, "policy_kwargs": {"net_arch": [16]}}
         spec = replace(spec, preset="sb3", overrides=small)
+    if algorithm == "gpo-penalty":  # on observations that are normalised
+        spec = read_suite(SMOKE.with_name("smoke-gpo.yml"))[1]
     directory, undisturbed = spec.directory(tmp_path), spec.directory(tmp_path / "undisturbed")
     with monkeypatch.context() as context:
         context.setattr(benchmarks.run, "Stopwatch", _Killed)
