@@ -190,6 +190,7 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
             self._check_can_compile(side_effects)
         self.chooses_behaviour = self._make_behaviour()
         self.coefficients = self.make_coefficients()
+        self._check_entropy_counts()
         self._keep_coefficients()
         self.programs = {}
         self._behaviour_state: BehaviourState = None
@@ -284,6 +285,20 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
                 "ent_coef", self.ent_coef, ENT_COEF_START, ENT_COEF_BOUNDS, self.lr_schedule(1), self.device
             )
         }
+
+    def _check_entropy_counts(self) -> None:
+        """
+        :raises ValueError: if there is no temperature, and an argument was given that would do nothing
+        """
+        if "ent_coef" in self.coefficients:
+            return
+        unused = {"ent_coef": "auto", "target_entropy": resolve_target_entropy("auto", self.action_space)}
+        for name, default in unused.items():
+            if getattr(self, name) != default:
+                raise ValueError(
+                    f"{type(self).__name__} has no entropy term, so {name} would do nothing: leave it out, got "
+                    f"{getattr(self, name)!r}."
+                )
 
     def _keep_coefficients(self) -> None:
         """Under the names that files know them by."""
@@ -464,6 +479,7 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         make_arguments_plain(self)
         self._check_arguments()
         self.coefficients = self.make_coefficients()
+        self._check_entropy_counts()
         for name, (spec, coefficient) in before.items():
             spec_now = getattr(self, name, None)
             if not any(other.startswith(name) for other in given):
