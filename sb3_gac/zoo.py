@@ -73,22 +73,39 @@ def _suggest_shared(trial: optuna.Trial) -> dict[str, Any]:
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
         "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 9),
         "tau": trial.suggest_float("tau", 1e-3, 0.05, log=True),
-        "target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"]),
         "net_arch": trial.suggest_categorical("net_arch", list(_NET_ARCHS)),
     }
 
 
+def _suggest_entropy(trial: optuna.Trial) -> dict[str, Any]:
+    return {"target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"])}
+
+
 def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
     """How far the guider may go."""
-    target_kl = trial.suggest_float("target_kl", 3e-4, 0.1, log=True)
     return {
-        "target_kl": target_kl,
+        **_suggest_entropy(trial),
+        "target_kl": trial.suggest_float("target_kl", 3e-4, 0.1, log=True),
         "kl_coef_learning_rate": trial.suggest_float("kl_coef_learning_rate", 3e-4, 3e-2, log=True),
     }
 
 
+def _suggest_distance(trial: optuna.Trial) -> dict[str, Any]:
+    """How far from its teacher the student may be."""
+    return {
+        "target_divergence": trial.suggest_float("target_divergence", 0.05, 10.0, log=True),
+        "teacher_coef_learning_rate": trial.suggest_float("teacher_coef_learning_rate", 3e-4, 3e-2, log=True),
+    }
+
+
 #: "all", or an algorithm, with its subclasses -> what it has to sample
-SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {"all": _suggest_shared, "gac": _suggest_guidance}
+SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {
+    "all": _suggest_shared,
+    "gac": _suggest_guidance,
+    "asymmetric_sac": _suggest_entropy,
+    "cosil": _suggest_distance,
+    "tgrl": _suggest_entropy,
+}
 
 
 def convert(sampled_params: dict[str, Any]) -> dict[str, Any]:

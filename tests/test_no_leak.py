@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC, OnnxPolicy, export_learner
+from sb3_gac import COSIL, GAC, TGRL, AsymmetricSAC, OnnxPolicy, export_learner
 from sb3_gac.envs import History
 from tests.helpers import Sampled, small_model
 
@@ -59,6 +59,7 @@ KINDS = {
     "gru of the learner alone": lambda: _recurrent("", Sampled(VECTORS), {"rnn_type": {"learner": "gru"}}),
     "cnn of the learner alone": lambda: small_model(Sampled(IMAGES), policy_kwargs=CNN, role_keys=STATE),
     "TGRL": lambda: small_model(Sampled(VECTORS), cls=TGRL, teacher=small_model(Sampled(VECTORS), cls=AsymmetricSAC)),
+    "COSIL": lambda: small_model(Sampled(VECTORS), cls=COSIL, teacher=small_model(Sampled(VECTORS), cls=AsymmetricSAC)),
 }
 
 

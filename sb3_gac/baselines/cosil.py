@@ -112,21 +112,21 @@ class COSIL(AsymmetricOffPolicyAlgorithm):
 
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The weight of the divergence, and no temperature."""
-        rate, bounds = self.teacher_coef_learning_rate, self.teacher_coef_bounds
-        return {
-            "teacher_coef": make_coefficient("teacher_coef", self.teacher_coef, TEACHER_COEF_START, bounds, rate, self.device)
-        }
+        spec, rate = self.teacher_coef, self.teacher_coef_learning_rate
+        weight = make_coefficient("teacher_coef", spec, TEACHER_COEF_START, self.teacher_coef_bounds, rate, self.device)
+        return {"teacher_coef": weight}
 
     def update(self, batch: Batch) -> Metrics:
         """The critics, the student, and the weight of the divergence."""
-        alpha = self.coefficients["teacher_coef"].value
+        weight = self.coefficients["teacher_coef"]
+        alpha = weight.value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
         (student,) = self.outputs(batch, "actor")
         metrics = self.minimize("critic", self.critic_loss, batch, student, noise[0], alpha)
         metrics |= self.minimize("actor", self.actor_loss, batch, student, noise[1], alpha)
         target = resolve_target_divergence(self.target_divergence, self.action_space)
-        metrics |= self.coefficients["teacher_coef"].update(metrics["divergence"] - target)
-        return metrics | self.coefficient_values()
+        metrics |= weight.update(metrics["divergence"] - target)
+        return metrics | self.coefficient_values() | {"teacher_coef_on_bound": weight.at_bound()}
 
     def critic_loss(self, batch: Batch, student: Outputs, noise: th.Tensor, alpha: th.Tensor) -> Loss:
         """r + gamma (1 - done) (min Q_bar - alpha D), of the student at the next observation."""
