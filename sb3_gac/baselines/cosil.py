@@ -110,6 +110,10 @@ class COSIL(AsymmetricOffPolicyAlgorithm):
         self.teacher_coef_learning_rate = teacher_coef_learning_rate
         super().__init__(policy, env, *sb3, **shared)
 
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        self.target_divergence = resolve_target_divergence(self.target_divergence, self.action_space)
+
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The weight of the divergence, and no temperature."""
         spec, rate = self.teacher_coef, self.teacher_coef_learning_rate
@@ -124,8 +128,7 @@ class COSIL(AsymmetricOffPolicyAlgorithm):
         (student,) = self.outputs(batch, "actor")
         metrics = self.minimize("critic", self.critic_loss, batch, student, noise[0], alpha)
         metrics |= self.minimize("actor", self.actor_loss, batch, student, noise[1], alpha)
-        target = resolve_target_divergence(self.target_divergence, self.action_space)
-        metrics |= weight.update(metrics["divergence"] - target)
+        metrics |= weight.update(metrics["divergence"] - float(self.target_divergence))
         return metrics | self.coefficient_values() | {"teacher_coef_on_bound": weight.at_bound()}
 
     def critic_loss(self, batch: Batch, student: Outputs, noise: th.Tensor, alpha: th.Tensor) -> Loss:

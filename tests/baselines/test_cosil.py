@@ -1,12 +1,12 @@
 """COSIL: a student near a teacher that sees more, a weight that holds it there, and no entropy."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 
 from sb3_gac import COSIL, TGRL, AsymmetricSAC
+from sb3_gac.base.update import Batch
 from sb3_gac.math.distributions import Categorical, TanhGaussian
 from sb3_gac.networks.heads import resolve_target_divergence
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
@@ -72,25 +72,18 @@ REWARDS = np.array([[[0.2, 1.0], [0.4, 0.2]], [[0.9, 0.1], [0.3, 0.3]]])
 LOGITS = np.array([[[1.2, 0.0], [0.0, 0.4]], [[0.0, 1.5], [-0.5, 0.5]]])
 
 
-class TwoStates(gym.Env):
+TWO_STATES = spaces.Dict(partial=spaces.Box(0, 1, (2,), np.float32), privileged=spaces.Box(0, 1, (1,), np.float32))
+
+
+def _every_transition():
     """The action is the next state; a coin that is privileged is tossed in every step, and counts for reward and teacher."""
-
-    observation_space = spaces.Dict(partial=spaces.Box(0, 1, (2,), np.float32), privileged=spaces.Box(0, 1, (1,), np.float32))
-    action_space = spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self._n_steps = 0
-        return self._enter(int(self.np_random.integers(2))), {}
-
-    def step(self, action):
-        reward = float(REWARDS[self._state, self._coin, action])
-        self._n_steps += 1
-        return self._enter(int(action)), reward, False, self._n_steps == 10, {}
-
-    def _enter(self, state):
-        self._state, self._coin = state, int(self.np_random.integers(2))
-        return {"partial": np.eye(2, dtype=np.float32)[state], "privileged": np.array([self._coin], np.float32)}
+    states, coins, actions, later_coins = th.cartesian_prod(*[th.arange(2)] * 4).T
+    now, later = (
+        {"partial": th.nn.functional.one_hot(state).float(), "privileged": coin[:, None].float()}
+        for state, coin in ((states, coins), (actions, later_coins))
+    )
+    rewards = th.tensor(REWARDS, dtype=th.float32)[states, coins, actions]
+    return Batch(now, actions[:, None], rewards, later, th.zeros(16), th.tensor(GAMMA))
 
 
 def _known_teacher(obs):
@@ -114,11 +107,12 @@ def _optimum(weight):
 
 
 def _trained_on_two_states(**arguments):
-    settings = {"gamma": GAMMA, "learning_rate": 3e-3, "tau": 0.05, "learning_starts": 2000, "buffer_size": 2000}
-    model = small_model(TwoStates(), COSIL, **settings, **arguments)
+    model = small_model(Sampled(TWO_STATES, spaces.Discrete(2)), COSIL, learning_rate=1e-2, tau=0.1, **arguments)
     model.frozen["teacher"] = _known_teacher
-    model.learn(2000)  # of uniform actions
-    model.train(gradient_steps=800, batch_size=128)
+    model.learn(1)
+    batch = _every_transition()
+    model._sample_batch = lambda batch_size: batch
+    model.train(gradient_steps=250)
     states = {"partial": th.eye(2), "privileged": th.zeros(2, 1)}
     with th.no_grad():
         q = model.policy.critic.values(model.policy.critic.encode(states), None).mean(dim=0)
@@ -128,18 +122,17 @@ def _trained_on_two_states(**arguments):
 def test_of_two_states_it_finds_values_and_policy():
     q, policy, divergence = _optimum(WEIGHT)
     _, found_q, found_policy = _trained_on_two_states(teacher_coef=WEIGHT)
-    np.testing.assert_allclose(found_q, q, atol=0.05)
-    np.testing.assert_allclose(found_policy, policy, atol=0.04)
-    assert (GAMMA * WEIGHT * divergence).min() > 0.03
+    np.testing.assert_allclose(found_q, q, atol=1e-3)
+    np.testing.assert_allclose(found_policy, policy, atol=1e-3)
+    assert (GAMMA * WEIGHT * divergence).min() > 0.02, "or the target's divergence would not show"
     assert np.abs(policy - _optimum(100.0)[1]).min() > 0.1, "the teacher alone is another one"
 
 
 def test_of_two_states_it_finds_the_weight_that_holds_the_target():
-    """Uniform actions are stored, so that both states are equally frequent, in the mean over which D is held."""
+    """Both states are equally frequent in the mean over which D is held."""
     divergence = _optimum(WEIGHT)[2].mean()
-    model, _, _ = _trained_on_two_states(target_divergence=divergence, teacher_coef_learning_rate=1e-2)
-    assert model.coefficients["teacher_coef"].value.item() == pytest.approx(WEIGHT, abs=0.05)
-    assert model.logger.name_to_value["train/divergence"] == pytest.approx(divergence, rel=0.5)
+    model, _, _ = _trained_on_two_states(target_divergence=divergence, teacher_coef_learning_rate=2e-2)
+    assert model.coefficients["teacher_coef"].value.item() == pytest.approx(WEIGHT, abs=2e-3)
 
 
 # --- the weight ---------------------------------------------------------------------------------------------------------
@@ -273,9 +266,8 @@ def test_it_trains_and_logs_what_it_holds(kind):
 def test_it_resumes_to_the_bit(kind, tmp_path):
     make_env, arguments = LIMITS[kind]
     teacher = make_teacher(make_env())
-    whole, part = (make_student(make_env(), teacher, **arguments) for _ in range(2))
-    whole.learn(40).learn(40, reset_num_timesteps=False)
-    part.learn(40).save_checkpoint(tmp_path)
+    whole = make_student(make_env(), teacher, **arguments).learn(40).learn(40, reset_num_timesteps=False)
+    make_student(make_env(), teacher, **arguments).learn(40).save_checkpoint(tmp_path)
     again = COSIL.resume(tmp_path, make_env(), teacher=teacher, device="cpu").learn(40, reset_num_timesteps=False)
     assert _same(whole, again)
     for (name, one), other in zip(whole.get_parameters().items(), again.get_parameters().values(), strict=True):
@@ -292,11 +284,9 @@ def test_a_student_of_a_good_teacher_needs_no_reward():
             observation, _, *rest = super().step(action)
             return observation, 0.0, *rest
 
-    teacher = make_teacher(learning_rate=3e-3, batch_size=64, learning_starts=100).learn(800)
-    model = make_student(Silent(), teacher, learning_rate=3e-3, batch_size=64, learning_starts=50).learn(400)
+    model = small_model(Silent(), COSIL, learning_rate=1e-2, batch_size=64, learning_starts=50)
+    model.frozen["teacher"] = lambda obs: TanhGaussian(th.atanh(obs["privileged"]), th.full_like(obs["privileged"], -1.0))
+    model.learn(300)
     targets = np.linspace(-0.7, 0.7, 15, dtype=np.float32)
-    partial = np.stack([targets, np.zeros(15, np.float32)], axis=1)
-    of_teacher, _ = teacher.predict({"partial": partial, "privileged": targets[:, None]}, deterministic=True)
-    of_student, _ = model.predict({"partial": partial}, deterministic=True)
-    assert np.abs(of_teacher[:, 0] - targets).mean() < 0.15, "the teacher knows"
-    assert np.abs(of_student - of_teacher).mean() < 0.15
+    actions, _ = model.predict({"partial": np.stack([targets, np.zeros(15, np.float32)], axis=1)}, deterministic=True)
+    assert np.abs(actions[:, 0] - targets).mean() < 0.1

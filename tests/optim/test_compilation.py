@@ -32,6 +32,8 @@ def _train(models, gradient_steps=3, batch_size=16):
 def _assert_equal(model, other, **tolerance):
     for (name, p), q in zip(model.policy.named_parameters(), other.policy.parameters(), strict=True):
         th.testing.assert_close(p, q, **tolerance, msg=lambda text, name=name: f"{name}: {text}")
+    for name, coefficient in model.coefficients.items():
+        th.testing.assert_close(coefficient.value, other.coefficients[name].value, **tolerance)
 
 
 @pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL, COSIL])
@@ -105,11 +107,15 @@ def test_an_optimiser_that_can_not_be_compiled_is_named():
 
 
 @pytest.mark.parametrize(
-    ("cls", "setting", "value"),
-    [(AsymmetricSAC, "max_grad_norm", 0.001), (GAC, "learner_kl_scale", 100.0), (COSIL, "target_divergence", 1e3)],
+    ("cls", "setting", "value", "before"),
+    [
+        (AsymmetricSAC, "max_grad_norm", 0.001, {}),
+        (GAC, "learner_kl_scale", 100.0, {}),
+        (COSIL, "target_divergence", 1e3, {"target_divergence": 0.0, "teacher_coef_learning_rate": 1.0}),
+    ],
 )
-def test_a_setting_that_is_compiled_in_is_noticed(cls, setting, value):
-    plain, compiled, unchanged = _filled(cls), _filled(cls, compile=True), _filled(cls)
+def test_a_setting_that_is_compiled_in_is_noticed(cls, setting, value, before):
+    plain, compiled, unchanged = _filled(cls, **before), _filled(cls, compile=True, **before), _filled(cls, **before)
     _train((plain, compiled, unchanged))
     for model in (plain, compiled):
         setattr(model, setting, value)
