@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
     from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
+    from sb3_gac.baselines.cosil import COSIL
     from sb3_gac.baselines.gpo import GPOClip, GPOPenalty
     from sb3_gac.baselines.tgrl import TGRL
     from sb3_gac.checkpoint.files import CheckpointError
@@ -74,6 +75,7 @@ def __dir__() -> list[str]:
 
 
 __all__ = [
+    "COSIL",
     "GAC",
     "PRESETS",
     "TGRL",

@@ -9,6 +9,7 @@ ALGORITHMS = {
     "gac_share": "sb3_gac.gac.ablations:GACShare",
     "gac_without_q": "sb3_gac.gac.ablations:GACWithoutQ",
     "asymmetric_sac": "sb3_gac.baselines.asymmetric_sac:AsymmetricSAC",
+    "cosil": "sb3_gac.baselines.cosil:COSIL",
     "tgrl": "sb3_gac.baselines.tgrl:TGRL",
     "gpo_clip": "sb3_gac.baselines.gpo:GPOClip",
     "gpo_penalty": "sb3_gac.baselines.gpo:GPOPenalty",

@@ -77,10 +77,11 @@ def _suggest_shared(trial: optuna.Trial) -> dict[str, Any]:
 
 
 def _suggest_off_policy(trial: optuna.Trial) -> dict[str, Any]:
-    return {
-        "tau": trial.suggest_float("tau", 1e-3, 0.05, log=True),
-        "target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"]),
-    }
+    return {"tau": trial.suggest_float("tau", 1e-3, 0.05, log=True)}
+
+
+def _suggest_entropy(trial: optuna.Trial) -> dict[str, Any]:
+    return {"target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"])}
 
 
 def _suggest_on_policy(trial: optuna.Trial) -> dict[str, Any]:
@@ -89,6 +90,14 @@ def _suggest_on_policy(trial: optuna.Trial) -> dict[str, Any]:
         "gae_lambda": trial.suggest_float("gae_lambda", 0.9, 0.99),
         "clip_range": trial.suggest_categorical("clip_range", [0.1, 0.2, 0.3]),
         "ent_coef": trial.suggest_float("ent_coef", 1e-4, 0.03, log=True),
+    }
+
+
+def _suggest_distance(trial: optuna.Trial) -> dict[str, Any]:
+    """How far from its teacher the student may be."""
+    return {
+        "target_divergence": trial.suggest_float("target_divergence", 0.05, 10.0, log=True),
+        "teacher_coef_learning_rate": trial.suggest_float("teacher_coef_learning_rate", 3e-4, 3e-2, log=True),
     }
 
 
@@ -106,9 +115,9 @@ def _suggest_gpo_penalty(trial: optuna.Trial) -> dict[str, Any]:
 
 def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
     """How far the guider may go."""
-    target_kl = trial.suggest_float("target_kl", 3e-4, 0.1, log=True)
     return {
-        "target_kl": target_kl,
+        **_suggest_entropy(trial),
+        "target_kl": trial.suggest_float("target_kl", 3e-4, 0.1, log=True),
         "kl_coef_learning_rate": trial.suggest_float("kl_coef_learning_rate", 3e-4, 3e-2, log=True),
     }
 
@@ -119,6 +128,9 @@ SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {
     "off_policy": _suggest_off_policy,
     "on_policy": _suggest_on_policy,
     "gac": _suggest_guidance,
+    "asymmetric_sac": _suggest_entropy,
+    "cosil": _suggest_distance,
+    "tgrl": _suggest_entropy,
     "gpo": _suggest_gpo,
     "gpo_clip": _suggest_gpo_clip,
     "gpo_penalty": _suggest_gpo_penalty,

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC, GPOClip, GPOPenalty, OnnxPolicy, export_learner
+from sb3_gac import COSIL, GAC, TGRL, AsymmetricSAC, GPOClip, GPOPenalty, OnnxPolicy, export_learner
 from sb3_gac.envs import History
 from tests.helpers import Sampled, small_model
 
@@ -63,6 +63,7 @@ KINDS = {
     "asymmetric SAC": lambda: small_model(Sampled(VECTORS), cls=AsymmetricSAC),
     "gru of the learner alone": lambda: _recurrent("", Sampled(VECTORS), {"rnn_type": {"learner": "gru"}}),
     "cnn of the learner alone": lambda: small_model(Sampled(IMAGES), policy_kwargs=CNN, role_keys=STATE),
+    "COSIL": lambda: small_model(Sampled(VECTORS), cls=COSIL, teacher=small_model(Sampled(VECTORS), cls=AsymmetricSAC)),
     "GPO": lambda: _on_policy(Sampled(VECTORS)),
     "GPO, normalised": lambda: _on_policy(_normalised()),
     "GPO, cnn, discrete": lambda: _on_policy(Sampled(IMAGES, CHOICE), CNN),

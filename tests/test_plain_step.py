@@ -13,17 +13,28 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import COSIL, GAC, TGRL, AsymmetricSAC, GACShare, GACWithoutQ
 from tests.helpers import gradient_step, noise_of_step, unlike_each_other
-from tests.plain.algorithm_1 import PlainGAC, PlainGACWithoutQ, PlainSAC, PlainTGRL, Settings
+from tests.plain.algorithm_1 import Coefficient, PlainGAC, PlainGACWithoutQ, PlainSAC, PlainTGRL, Settings
+from tests.plain.cosil import PlainCOSIL
 from tests.plain.replay import PlainReplay, Recorded
 
 BOUNDS = (-1.2, 0.4)
 SIZES = {"net_arch": [8, 6], "log_std_bounds": BOUNDS}
 MEMORY = {"net_arch": [6], "rnn_hidden_size": 5, "rnn_net_arch": [6]}
-SHARED = {"learning_rate": 0.01, "gamma": 0.9, "tau": 0.1, "ent_coef": "auto_0.3", "target_entropy": -0.7}
+SHARED = {"learning_rate": 0.01, "gamma": 0.9, "tau": 0.1}
+ENTROPY = {"ent_coef": "auto_0.3", "target_entropy": -0.7}
+NEAR = {
+    "target_divergence": 0.4,
+    "teacher_coef": "auto_2.0",
+    "teacher_coef_bounds": (0.5, 8.0),
+    "teacher_coef_learning_rate": 0.05,
+}
 GUIDED = {"target_kl": 0.2, "kl_coef": "auto_2.0", "kl_coef_bounds": (0.5, 8.0), "kl_coef_learning_rate": 0.05}
 PLAIN = {GAC: PlainGAC, GACShare: PlainGAC, GACWithoutQ: PlainGACWithoutQ, AsymmetricSAC: PlainSAC, TGRL: PlainTGRL}
+PLAIN |= {COSIL: PlainCOSIL}
+#: Algorithm, with its subclasses -> arguments of all its cases
+OF_ALL = {GAC: ENTROPY | GUIDED, AsymmetricSAC: ENTROPY, TGRL: ENTROPY, COSIL: NEAR}
 
 
 @dataclass
@@ -120,11 +131,20 @@ CASES = {
         TGRL, of_model={"policy_kwargs": {"rnn_type": dict.fromkeys(("actor", "auxiliary"), "gru")}}, cell="Gru"
     ),
     "LSTM, SAC, normalised": Case(AsymmetricSAC, cell="Lstm", normalised=True),
+    "COSIL": Case(COSIL),
+    "COSIL, clipped, n steps": Case(COSIL, CLIPPED | {"teacher_coef": 0.6}, of_model=N_STEPS),
+    "COSIL, bound of its weight": Case(COSIL, {"teacher_coef_bounds": (1.9, 2.05), "target_divergence": 1e-3}),
+    "COSIL, critics that see all": Case(COSIL, of_model={"role_keys": {"critic": ["partial", "privileged"]}}),
+    "COSIL, discrete": Case(COSIL, discrete=True),
+    "COSIL, GRU": Case(COSIL, cell="Gru"),
+    "COSIL, GRU, parts of episodes, discrete": Case(COSIL, of_model=PARTS, cell="Gru", discrete=True),
+    "COSIL, LSTM, normalised": Case(COSIL, cell="Lstm", normalised=True),
 }
 
 
 def _settings(case):
-    arguments = SHARED | (GUIDED if issubclass(case.cls, GAC) else {}) | case.arguments
+    (of_all,) = (arguments for cls, arguments in OF_ALL.items() if issubclass(case.cls, cls))
+    arguments = SHARED | of_all | case.arguments
     return Settings(**{"log_std_bounds": BOUNDS, **arguments, **case.resolved}), arguments
 
 
@@ -139,7 +159,7 @@ def _model(case, settings, arguments):
     sizes = {"optimizer_class": settings.optimizer, **(MEMORY if case.cell else SIZES), "log_std_bounds": BOUNDS}
     of_model = dict(case.of_model)
     sizes |= of_model.pop("policy_kwargs", {})
-    if case.cls is TGRL:
+    if case.cls.frozen_arguments:
         of_model["teacher"] = _teacher(case)
     model = case.cls(
         f"MultiInput{case.cell}Policy",
@@ -186,9 +206,12 @@ def test_a_gradient_step_is_the_plain_one(name):
     for key, start in before.items():
         moved = (th.cat([p.detach().flatten() for p in plain.networks[key].parameters()]) - start).abs().max()
         assert moved > 1e-3, f"{key} stood still: nothing was tested"
-    assert model.ent_coef_tensor.item() == pytest.approx(plain.beta.value.item(), rel=1e-5)
-    if issubclass(case.cls, GAC):
-        assert model.kl_coef_dual.value.item() == pytest.approx(plain.alpha.value.item(), rel=1e-5)
+    learned = {
+        one.name: one for one in vars(plain).values() if isinstance(one, Coefficient) and one.name in model.coefficients
+    }
+    assert set(model.coefficients) - set(learned) <= {"teacher_coef"}, "which TGRL moves by steps"
+    for coefficient, one in learned.items():
+        assert model.coefficients[coefficient].value.item() == pytest.approx(one.value.item(), rel=1e-5)
 
 
 def _assert_same(name, ours, theirs):

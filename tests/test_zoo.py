@@ -129,7 +129,7 @@ def test_the_zoos_own_algorithms_train(tmp_path):
 def test_every_algorithm_has_hyperparameters_that_it_takes_for_every_registered_task(algorithm):
     settings = hyperparameters(algorithm)
     assert {"default", "sb3_gac/Pendulum-v1"} == set(settings) - {f"sb3_gac/{task}-v5" for task in envs.suites.mujoco.TASKS}
-    assert settings[ENV]["role_keys"] == {"critic": ["privileged"]}
+    assert settings[ENV]["role_keys"] == (None if algorithm == "cosil" else {"critic": ["privileged"]})
     assert "role_keys" not in settings["default"], "elsewhere the privileged entry may not be the whole state"
     kind = algorithm_class(algorithm)
     off_policy = issubclass(kind, OffPolicyAlgorithm)
@@ -150,10 +150,12 @@ def test_every_argument_that_is_sampled_is_used():
         suggest_int = staticmethod(lambda name, low, high: low)
         suggest_categorical = staticmethod(lambda name, choices: choices[0])
 
-    shared = {"gamma", "learning_rate", "batch_size", "tau", "target_entropy", "policy_kwargs"}
-    of_gac, of_share, of_sac = (sample(name, Trial(), 1, 1, {}) for name in ("gac", "gac_share", "asymmetric_sac"))
-    assert set(of_sac) == shared
-    assert set(of_gac) == shared | {"target_kl", "kl_coef_learning_rate"}
+    shared = {"gamma", "learning_rate", "batch_size", "tau", "policy_kwargs"}
+    names = ("gac", "gac_share", "asymmetric_sac", "tgrl", "cosil")
+    of_gac, of_share, of_sac, of_tgrl, of_cosil = (sample(name, Trial(), 1, 1, {}) for name in names)
+    assert set(of_sac) == set(of_tgrl) == shared | {"target_entropy"}
+    assert set(of_cosil) == shared | {"target_divergence", "teacher_coef_learning_rate"}
+    assert set(of_gac) == set(of_sac) | {"target_kl", "kl_coef_learning_rate"}
     assert set(of_share) == set(of_gac), "as a subclass of GAC"
     assert (of_gac["gamma"], of_gac["batch_size"], of_gac["target_kl"]) == (0.999, 64, 3e-4)
     of_clip, of_penalty = (set(sample(name, Trial(), 1, 1, {})) for name in ("gpo_clip", "gpo_penalty"))

@@ -176,6 +176,24 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
             )
         }
 
+    def _keep_coefficients(self) -> None:
+        self._check_entropy_counts()
+        super()._keep_coefficients()
+
+    def _check_entropy_counts(self) -> None:
+        """
+        :raises ValueError: if there is no temperature, and an argument was given that would do nothing
+        """
+        if "ent_coef" in self.coefficients:
+            return
+        unused = {"ent_coef": "auto", "target_entropy": resolve_target_entropy("auto", self.action_space)}
+        for name, default in unused.items():
+            if getattr(self, name) != default:
+                raise ValueError(
+                    f"{type(self).__name__} has no entropy term, so {name} would do nothing: leave it out, got "
+                    f"{getattr(self, name)!r}."
+                )
+
     def _make_replay_buffer(self) -> ReplayBuffer:
         assert self.replay_buffer_class is not None
         options = self._replay_buffer_options()

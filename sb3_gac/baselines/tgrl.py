@@ -88,6 +88,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
         "window": partial(check_integer, low=1),
     }
     frozen_arguments = ("teacher",)
+    restored_arguments = (*AsymmetricOffPolicyAlgorithm.restored_arguments, "teacher_coef")
     compiled_settings = (*AsymmetricOffPolicyAlgorithm.compiled_settings, "target_entropy")
     policy: TGRLPolicy
 

@@ -167,3 +167,17 @@ def resolve_target_entropy(target_entropy: Any, action_space: spaces.Space) -> f
     if not math.isfinite(number):
         raise ValueError(f'target_entropy must be "auto", "sac" or a number, got {target_entropy!r}.')
     return number
+
+
+def resolve_target_divergence(target_divergence: str | float, action_space: spaces.Space) -> float:
+    """
+    :param target_divergence: a number; "auto": 0.5 per dimension, as much as a mean does that is off by one standard
+        deviation, or half of a uniform choice's entropy
+    :param action_space: Box or Discrete
+    :return: KL divergence in nats, summed over dimensions
+    """
+    if target_divergence != "auto":
+        return float(target_divergence)
+    if isinstance(action_space, spaces.Discrete):
+        return 0.5 * math.log(action_space.n)
+    return 0.5 * spaces.flatdim(action_space)

@@ -7,10 +7,10 @@ import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_gac import GAC, AsymmetricSAC
+from sb3_gac import COSIL, GAC, AsymmetricSAC
 from sb3_gac.checks.arguments import HANDED_ON, merged, unless
 from sb3_gac.checks.values import check_fraction, check_positive
-from tests.helpers import TwoViewBandit, small_model
+from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
 
 NAN, INF = float("nan"), float("inf")
 
@@ -99,7 +99,22 @@ GACS_OWN = {
     "learner_kl_scale": ([-1, NAN, INF, "full", None], 'learner_kl_scale must be a number >= 0, or "auto"'),
     "learner_entropy": (["yes", 2, None], r"learner_entropy must be one of \[False, True\]"),
 }
-ARGUMENTS = {GAC: {**SHARED, **GACS_OWN}, AsymmetricSAC: SHARED}
+COSILS_OWN = {
+    "teacher": ([small_model(TwoViewChoice(), AsymmetricSAC)], r"teacher was trained for actions in Discrete\(3\)"),
+    "target_divergence": ([-0.1, NAN, INF, "near", None], 'target_divergence must be a number >= 0, or "auto"'),
+    "teacher_coef": (
+        ["automatic", "auto_", "auto_1000", -1, NAN, None],
+        "teacher_coef(=.*outside teacher_coef_bounds| must be)",
+    ),
+    "teacher_coef_bounds": (
+        [(1, 0.1), (0, 1), (1,), 3, (1, INF), None],
+        r"teacher_coef_bounds must be a pair \(low, high\) with 0 < low",
+    ),
+    "teacher_coef_learning_rate": ([0, -1, NAN, "fast", None], "teacher_coef_learning_rate must be a number > 0"),
+    "ent_coef": ([0.0, 0.1, "auto_0.5", "automatic", None], "COSIL has no entropy term, so ent_coef would do nothing"),
+    "target_entropy": ([-3.0, "sac"], "COSIL has no entropy term, so target_entropy would do nothing"),
+}
+ARGUMENTS = {GAC: {**SHARED, **GACS_OWN}, AsymmetricSAC: SHARED, COSIL: {**SHARED, **COSILS_OWN}}
 CASES = [
     pytest.param(
         cls, name, value, message, id=f"{cls.__name__}-{name}-{'a function' if callable(value) else repr(value)[:30]}"
@@ -126,7 +141,8 @@ def test_no_argument_is_forgotten(cls):
 
 
 #: Checked where they are used, with what they depend on: by the set-up, or by what is made of them
-NOT_IN_TABLES = {"policy", "env", "ent_coef", "target_entropy", "kl_coef", "kl_coef_bounds"}
+NOT_IN_TABLES = {"policy", "env", "ent_coef", "target_entropy"}
+NOT_IN_TABLES |= {"kl_coef", "kl_coef_bounds", "teacher", "teacher_coef", "teacher_coef_bounds"}
 
 
 @pytest.mark.parametrize("cls", ARGUMENTS)
@@ -182,6 +198,9 @@ def test_what_is_at_the_edge_of_its_range_is_taken_again_and_again(cls, tmp_path
     }
     if cls is GAC:
         arguments |= {"target_kl": lambda left: 0.01 * left, "learner_kl_scale": 0, "kl_coef": "auto_100"}
+    if cls is COSIL:
+        small_model(cls=AsymmetricSAC).save(tmp_path / "teacher.zip")
+        arguments |= {"teacher": tmp_path / "teacher.zip", "target_divergence": 0, "teacher_coef": "auto_100"}
     model = small_model(cls=cls, **arguments).learn(6)
     model.save(tmp_path / "model")
     loaded = cls.load(tmp_path / "model", env=model.get_env())

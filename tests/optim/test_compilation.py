@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC
+from sb3_gac import COSIL, GAC, TGRL, AsymmetricSAC
 from sb3_gac.optim.compile import Program
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
 
@@ -15,9 +15,11 @@ TEACHER = small_model(cls=AsymmetricSAC, role_keys={"actor": ["partial", "privil
 
 
 def _filled(cls, **arguments):
-    if cls is TGRL:
-        arguments["teacher"] = TEACHER
-    return small_model(cls=cls, learning_starts=1000, **arguments).learn(64)
+    return small_model(cls=cls, learning_starts=1000, **_teacher_of(cls), **arguments).learn(64)
+
+
+def _teacher_of(cls):
+    return dict.fromkeys(cls.frozen_arguments, TEACHER)
 
 
 def _train(models, gradient_steps=3, batch_size=16):
@@ -30,9 +32,11 @@ def _train(models, gradient_steps=3, batch_size=16):
 def _assert_equal(model, other, **tolerance):
     for (name, p), q in zip(model.policy.named_parameters(), other.policy.parameters(), strict=True):
         th.testing.assert_close(p, q, **tolerance, msg=lambda text, name=name: f"{name}: {text}")
+    for name, coefficient in model.coefficients.items():
+        th.testing.assert_close(coefficient.value, other.coefficients[name].value, **tolerance)
 
 
-@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL])
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL, COSIL])
 def test_compiled_training_is_plain_training(cls, tmp_path):
     """Through other batch sizes and settings, new weights, a copy of the policy and a save: nothing stale is used."""
     plain, compiled = _filled(cls), _filled(cls, compile=True)
@@ -52,7 +56,7 @@ def test_compiled_training_is_plain_training(cls, tmp_path):
     _train((plain, compiled))
     _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
     compiled.save(tmp_path / "model")
-    loaded = cls.load(tmp_path / "model", env=TwoViewBandit(), **({"teacher": TEACHER} if cls is TGRL else {}))
+    loaded = cls.load(tmp_path / "model", env=TwoViewBandit(), **_teacher_of(cls))
     loaded.set_logger(compiled.logger)
     loaded.replay_buffer = compiled.replay_buffer
     assert loaded.compile
@@ -103,10 +107,15 @@ def test_an_optimiser_that_can_not_be_compiled_is_named():
 
 
 @pytest.mark.parametrize(
-    ("cls", "setting", "value"), [(AsymmetricSAC, "max_grad_norm", 0.001), (GAC, "learner_kl_scale", 100.0)]
+    ("cls", "setting", "value", "before"),
+    [
+        (AsymmetricSAC, "max_grad_norm", 0.001, {}),
+        (GAC, "learner_kl_scale", 100.0, {}),
+        (COSIL, "target_divergence", 1e3, {"target_divergence": 0.0, "teacher_coef_learning_rate": 1.0}),
+    ],
 )
-def test_a_setting_that_is_compiled_in_is_noticed(cls, setting, value):
-    plain, compiled, unchanged = _filled(cls), _filled(cls, compile=True), _filled(cls)
+def test_a_setting_that_is_compiled_in_is_noticed(cls, setting, value, before):
+    plain, compiled, unchanged = _filled(cls, **before), _filled(cls, compile=True, **before), _filled(cls, **before)
     _train((plain, compiled, unchanged))
     for model in (plain, compiled):
         setattr(model, setting, value)

@@ -99,9 +99,9 @@ class Settings:
     learning_rate: float
     gamma: float
     tau: float
-    ent_coef: str | float
-    target_entropy: float
     log_std_bounds: tuple[float, float]
+    ent_coef: str | float = 0.0
+    target_entropy: float = 0.0
     target_kl: float = 0.0
     kl_coef: str | float = 0.0
     kl_coef_bounds: tuple[float, float] = (1e-4, 100.0)
@@ -112,7 +112,10 @@ class Settings:
     shared_std: str = "learner"
     pull: float = 0.0
     learner_entropy: bool = True
-    teacher_coef: float = 1.0
+    teacher_coef: str | float = 1.0
+    teacher_coef_bounds: tuple[float, float] = (1e-4, 100.0)
+    teacher_coef_learning_rate: float = 1e-3
+    target_divergence: float = 0.0
     max_grad_norm: float | None = None
     target_update_interval: int = 1
     optimizer: type[th.optim.Optimizer] = th.optim.SGD
