@@ -61,6 +61,7 @@ SUM = {"kl_reduction": "sum", "target_kl": 0.4}
 CLIPPED = {"max_grad_norm": 0.5}
 N_STEPS = {"n_steps": 3}
 PARTS = {"replay_buffer_kwargs": {"sequence_length": 2, "burn_in": 2}}
+PAIRS, FOUR = {"critic_groups": 2}, {"policy_kwargs": {"n_critics": 4}}
 OTHERS = {
     "kl_coef": 0.7,
     "ent_coef": 0.2,
@@ -104,6 +105,9 @@ CASES = {
     "SAC, full state": Case(AsymmetricSAC, of_model={"role_keys": {"actor": ["partial", "privileged"]}}),
     "SAC, normalised, n steps": Case(AsymmetricSAC, of_model=N_STEPS, normalised=True),
     "SAC, discrete": Case(AsymmetricSAC, {"target_entropy": 0.8}, discrete=True),
+    "SAC, two pairs of critics": Case(AsymmetricSAC, PAIRS, of_model=FOUR),
+    "SAC, two pairs of critics, discrete": Case(AsymmetricSAC, PAIRS | {"target_entropy": 0.8}, of_model=FOUR, discrete=True),
+    "GRU, SAC, two pairs of critics": Case(AsymmetricSAC, PAIRS, of_model=FOUR, cell="Gru"),
     "discrete": Case(GAC, {"target_entropy": 0.8}, discrete=True),
     "discrete, pulled": Case(GAC, CLIPPED, {"pull": 1.0}, {"learner_kl_scale": 1.0}, discrete=True),
     "discrete, independent": Case(GAC, INDEPENDENT, {"pull": 1.0}, discrete=True),

@@ -1,14 +1,21 @@
 """Soft Actor-Critic whose critics see more than its actor: SAC-asym, and with other keys SAC on either view."""
 
-from typing import ClassVar
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from typing_extensions import Unpack
 
+from sb3_gac.base.arguments import OffPolicyArguments
 from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles
 from sb3_gac.base.update import Batch, Loss, Metrics, Outputs
+from sb3_gac.checks.arguments import ArgumentCheck
+from sb3_gac.checks.values import check_integer
 from sb3_gac.math.losses import masked_mean, policy_loss
 from sb3_gac.networks.actors import Actor
 from sb3_gac.networks.critics import CriticEnsemble
@@ -40,7 +47,11 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
     SAC with an actor on ``partial`` and critics on every entry (Pinto et al. 2018, arXiv 1710.06542, with SAC's losses).
 
     ``role_keys={"critic": ["partial"]}`` makes it SAC on the partial view, ``role_keys={"actor": ["partial",
-    "privileged"]}`` SAC on the full state. Arguments are those of :class:`AsymmetricOffPolicyAlgorithm`.
+    "privileged"]}`` SAC on the full state. Arguments that are not described here are those of
+    :class:`AsymmetricOffPolicyAlgorithm`.
+
+    :param critic_groups: groups of the same size that the critics form: each learns from its own minimum, and the actor
+        climbs the mean of the minima. With ``policy_kwargs={"n_critics": 4}`` and 2 groups it has as many critics as GAC
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -49,7 +60,27 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         "MultiInputLstmPolicy": AsymmetricSACLstmPolicy,
     }
     policy: AsymmetricSACPolicy
-    compiled_settings = (*AsymmetricOffPolicyAlgorithm.compiled_settings, "target_entropy")
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {"critic_groups": partial(check_integer, low=1)}
+    compiled_settings = (*AsymmetricOffPolicyAlgorithm.compiled_settings, "target_entropy", "critic_groups")
+
+    def __init__(
+        self,
+        policy: str | type[AsymmetricSACPolicy],
+        env: GymEnv | str | None,
+        *sb3: Any,
+        critic_groups: int = 1,
+        **shared: Unpack[OffPolicyArguments],
+    ):
+        self.critic_groups = critic_groups
+        super().__init__(policy, env, *sb3, **shared)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.policy.n_critics % self.critic_groups:
+            raise ValueError(
+                f"critic_groups={self.critic_groups} can't be of the same size with {self.policy.n_critics} critics: give "
+                'policy_kwargs={"n_critics": <a multiple of it>}.'
+            )
 
     def update(self, batch: Batch) -> Metrics:
         """SAC's; its critics are eq. 15's with the entropy term, its actor eq. 16's without a guider."""
@@ -63,15 +94,38 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
 
     def critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """The actor's return, with its entropy."""
+        targets = []
         with th.no_grad():
-            next_q, log_prob = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
-            target = batch.soft_target(next_q, next_log_prob=log_prob, ent_coef=beta)
+            for group in self.groups(batch.q_at_next_obs(self.policy.critic_target)):
+                next_q, log_prob = actor.later.value_and_log_prob(group, noise)
+                targets.append(batch.soft_target(next_q, next_log_prob=log_prob, ent_coef=beta))
+            target = th.stack(targets).repeat_interleave(self.policy.n_critics // self.critic_groups, dim=0)
         return self.bellman_loss("critic", batch, target)
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """Climb the critics, with entropy."""
         now = self.now("actor", actor, batch)
-        q, log_prob = now.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
+        groups = self.groups(batch.q_at_obs(self.policy.critic))
+        q, log_prob = now.value_and_log_prob(lambda actions: _mean_of_minima([group(actions) for group in groups]), noise)
         seen = {f"actor_{name}": masked_mean(values, batch.mask) for name, values in now.diagnostics().items()}
         loss = policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask)
         return Loss(loss, {"entropy": -masked_mean(log_prob, batch.mask), **seen})
+
+    def groups(self, q_function: Callable[[Any], th.Tensor]) -> list[Callable[[Any], th.Tensor]]:
+        r"""
+        :param q_function: actions -> values of N critics, shape (N, \*E)
+        :return: of each group of critics, actions -> their values
+        """
+        if self.critic_groups == 1:
+            return [q_function]
+        size = self.policy.n_critics // self.critic_groups
+
+        def group(first: int, actions: Any) -> th.Tensor:
+            return q_function(actions)[first : first + size]
+
+        return [partial(group, first) for first in range(0, self.policy.n_critics, size)]
+
+
+def _mean_of_minima(groups: list[th.Tensor]) -> th.Tensor:
+    """One group is left as it is: its minimum is taken where it counts."""
+    return groups[0] if len(groups) == 1 else th.stack([q.amin(dim=0) for q in groups]).mean(dim=0, keepdim=True)

@@ -150,3 +150,16 @@ def test_runs_are_reproducible():
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         _small(**arguments)
+
+
+def test_groups_of_critics_are_of_one_size():
+    message = r"critic_groups=2 can't be of the same size with 3 critics: give policy_kwargs"
+    with pytest.raises(ValueError, match=message):
+        small_model(cls=AsymmetricSAC, critic_groups=2, policy_kwargs={"n_critics": 3})
+
+
+def test_groups_of_critics_are_compiled():
+    arguments = {"critic_groups": 2, "policy_kwargs": {"net_arch": [8], "n_critics": 4}}
+    plain, compiled = (small_model(cls=AsymmetricSAC, compile=compile, **arguments).learn(25) for compile in (False, True))
+    for p, q in zip(plain.policy.parameters(), compiled.policy.parameters(), strict=True):
+        th.testing.assert_close(p, q, rtol=1e-4, atol=1e-6)

@@ -5,9 +5,10 @@ import inspect
 import numpy as np
 import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_gac import COSIL, GAC, AsymmetricSAC
+from sb3_gac import COSIL, GAC, AsymmetricSAC, GPOClip, GPOPenalty
 from sb3_gac.checks.arguments import HANDED_ON, merged, unless
 from sb3_gac.checks.values import check_fraction, check_positive
 from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
@@ -114,7 +115,43 @@ COSILS_OWN = {
     "ent_coef": ([0.0, 0.1, "auto_0.5", "automatic", None], "COSIL has no entropy term, so ent_coef would do nothing"),
     "target_entropy": ([-3.0, "sac"], "COSIL has no entropy term, so target_entropy would do nothing"),
 }
-ARGUMENTS = {GAC: {**SHARED, **GACS_OWN}, AsymmetricSAC: SHARED, COSIL: {**SHARED, **COSILS_OWN}}
+SACS_OWN = {"critic_groups": ([0, -1, 1.5, "two", None, 3], r"critic_groups( must be an integer >= 1|=3 can't be)")}
+OFF_POLICY = {"buffer_size", "learning_starts", "tau", "train_freq", "gradient_steps", "action_noise", "ent_coef"}
+OFF_POLICY |= {
+    "optimize_memory_usage",
+    "target_update_interval",
+    "target_entropy",
+    "policy_delay",
+    "update_every",
+    "behaviour",
+}
+OFF_POLICY |= {"behaviour_per", "replay_buffer_class", "replay_buffer_kwargs"}
+ON_POLICY = {name: entry for name, entry in SHARED.items() if name not in OFF_POLICY} | {
+    "n_epochs": ([0, -1, 1.5, None], "n_epochs must be an integer >= 1"),
+    "gae_lambda": ([-0.1, 1.1, NAN, "far", None], "gae_lambda must be a number from 0 to 1"),
+    "clip_range": (
+        [0, -0.1, NAN, "far", None, lambda _: -1.0],
+        "clip_range( at the (start|end) of training)? must be a number >",
+    ),
+    "normalize_advantage": (["yes", 2, None], r"normalize_advantage must be one of \[False, True\]"),
+    "ent_coef": (["auto", -1, NAN, INF, None], "ent_coef must be a number >= 0"),
+    "vf_coef": (["half", -1, NAN, INF, None], "vf_coef must be a number >= 0"),
+    "reward_scale": ([0, -1, NAN, INF, None], "reward_scale must be a number > 0"),
+    "unroll_length": ([0, -1, 1.5, "long"], "unroll_length must be an integer >= 1, or None for the whole rollout"),
+    "learner_rl_coef": (["much", -1, NAN, INF, None], "learner_rl_coef must be a number >= 0"),
+}
+CLIPS_OWN = {"delta": ([0, 1, -0.1, 1.5, NAN, "near", None], "delta must be a number between 0 and 1")}
+PENALTYS_OWN = {
+    "target_kl": ([0, -1, NAN, INF, None], "target_kl must be a number > 0"),
+    "largest_kl_coef": ([0, -1, NAN, INF, None], "largest_kl_coef must be a number > 0"),
+}
+ARGUMENTS = {
+    GAC: {**SHARED, **GACS_OWN},
+    AsymmetricSAC: {**SHARED, **SACS_OWN},
+    COSIL: {**SHARED, **COSILS_OWN},
+    GPOClip: {**ON_POLICY, **CLIPS_OWN},
+    GPOPenalty: {**ON_POLICY, **PENALTYS_OWN},
+}
 CASES = [
     pytest.param(
         cls, name, value, message, id=f"{cls.__name__}-{name}-{'a function' if callable(value) else repr(value)[:30]}"
@@ -129,7 +166,8 @@ CASES = [
 def test_an_argument_out_of_its_range_is_named(cls, name, value, message):
     if value == {"POLICY": 1.5}:
         value = {cls.policy_aliases["MultiInputPolicy"].roles.deployed: 1.5}
-    arguments = {"policy": "MultiInputPolicy", "env": TwoViewBandit(), "buffer_size": 100, name: value}
+    small = {"buffer_size": 100} if "buffer_size" in ARGUMENTS[cls] else {"n_steps": 8}
+    arguments = {"policy": "MultiInputPolicy", "env": TwoViewBandit(), **small, name: value}
     with pytest.raises(ValueError, match=message):
         cls(**arguments)
 
@@ -148,7 +186,8 @@ NOT_IN_TABLES |= {"kl_coef", "kl_coef_bounds", "teacher", "teacher_coef", "teach
 @pytest.mark.parametrize("cls", ARGUMENTS)
 def test_every_argument_has_a_check_in_the_tables_or_needs_none_there(cls):
     checks = merged(cls, "argument_checks")
-    assert set(checks) == set(ARGUMENTS[cls]) - NOT_IN_TABLES
+    elsewhere = NOT_IN_TABLES - {"ent_coef"} if issubclass(cls, OnPolicyAlgorithm) else NOT_IN_TABLES
+    assert set(checks) == set(ARGUMENTS[cls]) - elsewhere
     defaults = {name: parameter.default for name, parameter in inspect.signature(cls).parameters.items()}
     for name, check in checks.items():
         check(name, {} if name in HANDED_ON else defaults[name])
@@ -201,7 +240,18 @@ def test_what_is_at_the_edge_of_its_range_is_taken_again_and_again(cls, tmp_path
     if cls is COSIL:
         small_model(cls=AsymmetricSAC).save(tmp_path / "teacher.zip")
         arguments |= {"teacher": tmp_path / "teacher.zip", "target_divergence": 0, "teacher_coef": "auto_100"}
-    model = small_model(cls=cls, **arguments).learn(6)
+    if issubclass(cls, OnPolicyAlgorithm):
+        of_rollouts = {
+            "ent_coef": 0,
+            "gae_lambda": 1,
+            "clip_range": lambda left: 0.3 * left,
+            "n_steps": np.int64(3),
+            "batch_size": 3,
+        }
+        arguments = {name: value for name, value in arguments.items() if name in ARGUMENTS[cls]} | of_rollouts
+        model = cls("MultiInputPolicy", TwoViewBandit(), device="cpu", **arguments).learn(6)
+    else:
+        model = small_model(cls=cls, **arguments).learn(6)
     model.save(tmp_path / "model")
     loaded = cls.load(tmp_path / "model", env=model.get_env())
     assert loaded.learn(6)._n_updates > 0

@@ -93,6 +93,7 @@ class Settings:
 
     :param shared_std: whose std guider and learner have
     :param pull: weight of the KL in the learner's objective, as a multiple of alpha
+    :param critic_groups: of SAC, each with a minimum of its own
     :param rates: network -> learning rate, where it is not ``learning_rate``
     """
 
@@ -112,6 +113,7 @@ class Settings:
     shared_std: str = "learner"
     pull: float = 0.0
     learner_entropy: bool = True
+    critic_groups: int = 1
     teacher_coef: str | float = 1.0
     teacher_coef_bounds: tuple[float, float] = (1e-4, 100.0)
     teacher_coef_learning_rate: float = 1e-3
@@ -167,14 +169,15 @@ class PlainAlgorithm:
 
         return values
 
-    def fit_critics(self, name: str, batch: Batch, y: th.Tensor) -> None:
-        """Half the mean square of each critic's error, summed up over critics."""
+    def fit_critics(self, name: str, batch: Batch, y: th.Tensor | list[th.Tensor]) -> None:
+        """Half the mean square of each critic's error, summed up over critics; targets are one for all, or one for each."""
         critics = self.networks[name]
         if self.discrete:
             q = [values.gather(-1, batch.actions.long())[..., 0] for values in self.q(critics, batch)(None)]
         else:
             q = self.q(critics, batch)(batch.actions)
-        loss = th.stack([0.5 * batch.mean((one - y).square()) for one in q]).sum()
+        targets = y if isinstance(y, list) else [y] * len(q)
+        loss = th.stack([0.5 * batch.mean((one - to).square()) for one, to in zip(q, targets, strict=True)]).sum()
         self.logged[f"{name}_q"] = th.stack([batch.mean(one) for one in q]).mean()
         self.logged[f"{name}_loss"] = loss
         self.descend(name, loss)
@@ -347,17 +350,25 @@ class PlainSAC(PlainAlgorithm):
         """
         beta, critics, targets = self.beta.value, self.networks["critic"], self.targets["critic_target"]
         now, later = (self.distribution(outputs) for outputs in self.outputs(self.networks["actor"], batch))
-        with th.no_grad():
-            q, log_prob = later.value_and_log_prob(self.q(targets, batch, later=True), noise[0])
-            y = batch.rewards + batch.discounts * (1 - batch.terminated) * (q - beta * log_prob)
+        y = []
+        for group in self.groups(targets):
+            with th.no_grad():
+                q, log_prob = later.value_and_log_prob(self.q(group, batch, later=True), noise[0])
+                y += [batch.rewards + batch.discounts * (1 - batch.terminated) * (q - beta * log_prob)] * len(group)
         self.fit_critics("critic", batch, y)
-        q, log_prob = now.value_and_log_prob(self.q(critics, batch), noise[1])
-        actor_loss = batch.mean(beta * log_prob - q)
+        found = [now.value_and_log_prob(self.q(group, batch), noise[1]) for group in self.groups(critics)]
+        log_prob = found[0][1]
+        actor_loss = batch.mean(beta * log_prob - sum(q for q, _ in found) / len(found))
         self.descend("actor", actor_loss)
         self.logged |= self.beta.update(batch.mean(log_prob) + self.settings.target_entropy)
         self.update_targets()
         self.logged |= {"actor_loss": actor_loss, "entropy": -batch.mean(log_prob)}
         return self.logged | self.described("actor", now, batch)
+
+    def groups(self, critics: Any) -> list[list[nn.Module]]:
+        """Of as many critics each."""
+        size = len(critics) // self.settings.critic_groups
+        return [list(critics)[first : first + size] for first in range(0, len(critics), size)]
 
 
 class PlainTGRL(PlainAlgorithm):
