@@ -343,13 +343,20 @@ class AsymmetricOffPolicyAlgorithm(ConstructorArguments, DeploymentGuard, Resuma
         :param n_envs: number of environments
         :return: action for the environments, and the same scaled to [-1, 1] for the buffer
         """
+        action, scaled_action = self._next_action(learning_starts, action_noise, n_envs)
+        self._behaviour_state = self.policy.with_actions(self._behaviour_state, scaled_action)
+        return action, scaled_action
+
+    def _next_action(
+        self, learning_starts: int, action_noise: ActionNoise | None, n_envs: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         warms_up = self.num_timesteps < learning_starts
         episode_starts = np.ones(n_envs, dtype=bool) if self._last_episode_starts is None else self._last_episode_starts
         if len(self.acting) != n_envs:
             self._begin_episodes(n_envs)
         self.acting = self.choose_acting(episode_starts)
         self._has_warmed_up |= warms_up
-        if warms_up and not self.is_recurrent:
+        if warms_up and not (self.is_recurrent or self.policy.remembers):
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, dict)
         trained = [self.policy.roles.behaviour if role in self.frozen else role for role in self.acting]

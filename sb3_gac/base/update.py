@@ -21,7 +21,9 @@ from sb3_gac.networks.actors import RolePolicy
 from sb3_gac.optim.coefficients import Coefficient
 from sb3_gac.optim.compile import Program
 from sb3_gac.optim.parallel import halved_threads, run_side_by_side
+from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.episodes import EpisodeReplayBuffer, SequenceSamples
+from sb3_gac.replay.histories import Histories
 
 #: Name -> detached scalar, left on the device
 Metrics = dict[str, th.Tensor]
@@ -39,6 +41,8 @@ class Batch(NamedTuple):
     :param discounts: gamma to the number of steps that the reward sums up, scalar or shape (\*E)
     :param sequence: of sequences, observations and the last next one together, (T + 1, B, ...) of each entry
     :param mask: of sequences, 1 for what counts, 0 for padding and for what only brings memories up, shape (T, B)
+    :param histories: of transitions, what came before each, if the algorithm's :attr:`NetworkTraining.history_length` asks
+        for it
     """
 
     observations: PyTorchObs
@@ -49,6 +53,7 @@ class Batch(NamedTuple):
     discounts: th.Tensor
     sequence: PyTorchObs | None = None
     mask: th.Tensor | None = None
+    histories: Histories | None = None
 
     def outputs(self, policy: RolePolicy) -> "Outputs":
         """
@@ -160,6 +165,16 @@ class NetworkTraining(FaultTolerance):
     _waiting = False
 
     # --- what an algorithm writes, and what it writes it with ---------------------------------------------------------
+
+    @property
+    def history_length(self) -> int:
+        """Steps before each transition that the batches of the next gradient steps have, see ``Batch.histories``."""
+        return 0
+
+    @property
+    def at_rest(self) -> frozenset[str]:
+        """Networks that the next gradient steps leave as they are, whatever is minimised: those of another phase."""
+        return frozenset()
 
     @abstractmethod
     def update(self, batch: Batch) -> Metrics:
@@ -280,15 +295,19 @@ class NetworkTraining(FaultTolerance):
         settings = (getattr(self, name) for name in self.compiled_settings)
         self._program_key = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
         update_every = resolve_update_every(self.policy.roles, self.policy_delay, self.update_every)
+        at_rest = self.at_rest
+        for name in at_rest:
+            getattr(self.policy, name).train(False)
+        targets_follow = not set(self.policy.pairs) <= at_rest
         history: list[Metrics] = []
         with halved_threads(self._at_once):
             for _ in range(gradient_steps):
                 batch = self._sample_batch(batch_size)
-                self._resting = frozenset(name for name, every in update_every.items() if self._n_updates % every)
+                self._resting = at_rest.union(name for name, every in update_every.items() if self._n_updates % every)
                 whole = self.compile and not self._in_several_programs
                 history.append(self._compiled("update", self.update, batch) if whole else self.update(batch))
                 self._n_updates += 1
-                if self._n_updates % self.target_update_interval == 0:
+                if targets_follow and self._n_updates % self.target_update_interval == 0:
                     self.policy.update_targets(self.tau)
         self._record_metrics(history)
 
@@ -328,8 +347,14 @@ class NetworkTraining(FaultTolerance):
         return nullcontext()
 
     def _sample_batch(self, batch_size: int) -> Batch:
-        assert self.replay_buffer is not None
-        samples = self.replay_buffer.sample(batch_size, env=self.sampling_env)
+        buffer, histories = self.replay_buffer, None
+        assert buffer is not None
+        samples: Any
+        if self.history_length:
+            assert isinstance(buffer, CompactDictReplayBuffer)
+            samples, histories = buffer.sample_with_histories(batch_size, self.history_length, env=self.sampling_env)
+        else:
+            samples = buffer.sample(batch_size, env=self.sampling_env)
         discounts = getattr(samples, "discounts", None)
         if discounts is None:
             discounts = th.full((), self.gamma, device=self.device)
@@ -345,6 +370,7 @@ class NetworkTraining(FaultTolerance):
             samples.next_observations,
             samples.dones.flatten(),
             discounts.flatten() if discounts.dim() else discounts,
+            histories=histories,
         )
 
     def refresh_schedules(self) -> None:
@@ -377,8 +403,10 @@ class NetworkTraining(FaultTolerance):
         nothing = th.zeros((), device=self.device)
         sums = th.stack([th.stack([step.get(name, nothing) for name in counts]) for step in history]).sum(dim=0).tolist()
         values = {name: total / count for (name, count), total in zip(counts.items(), sums, strict=True)}
-        values["actor_loss"] = values[f"{self.policy.roles.deployed}_loss"]  # SB3's names for the two
-        values["critic_loss"] = sum(value for name, value in values.items() if name.endswith("critic_loss"))
+        if (of_deployed := f"{self.policy.roles.deployed}_loss") in values:  # SB3's names for the two
+            values["actor_loss"] = values[of_deployed]
+        if of_critics := [value for name, value in values.items() if name.endswith("critic_loss")]:
+            values["critic_loss"] = sum(of_critics)
         for name, value in values.items():
             self.logger.record(f"train/{name}", value)
         coefficients = {name: coefficient.value for name, coefficient in self.coefficients.items()}
