@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
     from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
+    from sb3_gac.baselines.rma import RMA
     from sb3_gac.baselines.tgrl import TGRL
     from sb3_gac.checkpoint.files import CheckpointError
     from sb3_gac.checks.divergence import DivergenceError
@@ -75,6 +76,7 @@ def __dir__() -> list[str]:
 __all__ = [
     "GAC",
     "PRESETS",
+    "RMA",
     "TGRL",
     "AsymmetricSAC",
     "CheckpointError",

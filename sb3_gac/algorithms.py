@@ -9,6 +9,7 @@ ALGORITHMS = {
     "gac_share": "sb3_gac.gac.ablations:GACShare",
     "gac_without_q": "sb3_gac.gac.ablations:GACWithoutQ",
     "asymmetric_sac": "sb3_gac.baselines.asymmetric_sac:AsymmetricSAC",
+    "rma": "sb3_gac.baselines.rma:RMA",
     "tgrl": "sb3_gac.baselines.tgrl:TGRL",
 }
 _NAMES = {path: name for name, path in ALGORITHMS.items()}

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC, OnnxPolicy, export_learner
+from sb3_gac import GAC, RMA, TGRL, AsymmetricSAC, OnnxPolicy, export_learner
 from sb3_gac.envs import History
 from tests.helpers import Sampled, small_model
 
@@ -37,8 +37,8 @@ def _recurrent(cell, env, policy_kwargs=None, **arguments):
     return GAC(f"MultiInput{cell}Policy", env, policy_kwargs=options, **arguments)
 
 
-def _normalised():
-    return VecNormalize(make_vec_env(lambda: Sampled(VECTORS), 2, seed=0))
+def _normalised(action_space=None):
+    return VecNormalize(make_vec_env(lambda: Sampled(VECTORS, action_space), 2, seed=0))
 
 
 KINDS = {
@@ -59,6 +59,9 @@ KINDS = {
     "gru of the learner alone": lambda: _recurrent("", Sampled(VECTORS), {"rnn_type": {"learner": "gru"}}),
     "cnn of the learner alone": lambda: small_model(Sampled(IMAGES), policy_kwargs=CNN, role_keys=STATE),
     "TGRL": lambda: small_model(Sampled(VECTORS), cls=TGRL, teacher=small_model(Sampled(VECTORS), cls=AsymmetricSAC)),
+    "RMA": lambda: small_model(Sampled(VECTORS), cls=RMA, history=3),
+    "RMA, discrete, normalised": lambda: small_model(_normalised(CHOICE), cls=RMA, history=12),
+    "RMA, cnn": lambda: small_model(Sampled(IMAGES), cls=RMA, history=2, policy_kwargs=CNN, batch_size=4),
 }
 
 
