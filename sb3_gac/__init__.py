@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
     from sb3_gac.baselines.cosil import COSIL
     from sb3_gac.baselines.gpo import GPOClip, GPOPenalty
+    from sb3_gac.baselines.rma import RMA
     from sb3_gac.baselines.tgrl import TGRL
     from sb3_gac.checkpoint.files import CheckpointError
     from sb3_gac.checks.divergence import DivergenceError
@@ -78,6 +79,7 @@ __all__ = [
     "COSIL",
     "GAC",
     "PRESETS",
+    "RMA",
     "TGRL",
     "AsymmetricSAC",
     "CheckpointError",

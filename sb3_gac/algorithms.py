@@ -10,6 +10,7 @@ ALGORITHMS = {
     "gac_without_q": "sb3_gac.gac.ablations:GACWithoutQ",
     "asymmetric_sac": "sb3_gac.baselines.asymmetric_sac:AsymmetricSAC",
     "cosil": "sb3_gac.baselines.cosil:COSIL",
+    "rma": "sb3_gac.baselines.rma:RMA",
     "tgrl": "sb3_gac.baselines.tgrl:TGRL",
     "gpo_clip": "sb3_gac.baselines.gpo:GPOClip",
     "gpo_penalty": "sb3_gac.baselines.gpo:GPOPenalty",

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-from sb3_gac import COSIL, GAC, TGRL, AsymmetricSAC, GPOClip, GPOPenalty, OnnxPolicy, export_learner
+from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricSAC, GPOClip, GPOPenalty, OnnxPolicy, export_learner
 from sb3_gac.envs import History
 from tests.helpers import Sampled, small_model
 
@@ -42,8 +42,8 @@ def _on_policy(env, policy_kwargs=None, cls=GPOClip):
     return cls("MultiInputPolicy", env, n_steps=10, batch_size=10, seed=0, device="cpu", policy_kwargs=options)
 
 
-def _normalised():
-    return VecNormalize(make_vec_env(lambda: Sampled(VECTORS), 2, seed=0))
+def _normalised(action_space=None):
+    return VecNormalize(make_vec_env(lambda: Sampled(VECTORS, action_space), 2, seed=0))
 
 
 KINDS = {
@@ -69,6 +69,9 @@ KINDS = {
     "GPO, cnn, discrete": lambda: _on_policy(Sampled(IMAGES, CHOICE), CNN),
     "GPO-penalty, shared encoder": lambda: _on_policy(Sampled(VECTORS), SHARED, GPOPenalty),
     "TGRL": lambda: small_model(Sampled(VECTORS), cls=TGRL, teacher=small_model(Sampled(VECTORS), cls=AsymmetricSAC)),
+    "RMA": lambda: small_model(Sampled(VECTORS), cls=RMA, history=3),
+    "RMA, discrete, normalised": lambda: small_model(_normalised(CHOICE), cls=RMA, history=12),
+    "RMA, cnn": lambda: small_model(Sampled(IMAGES), cls=RMA, history=2, policy_kwargs=CNN, batch_size=4),
 }
 
 

@@ -1,6 +1,7 @@
 """What off-policy algorithms with a privileged view share: arguments, their checks, acting and save lists."""
 
 import warnings
+from abc import abstractmethod
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any, ClassVar
@@ -21,7 +22,7 @@ from sb3_gac.base.collecting import DataCollection
 from sb3_gac.base.overrides import check_known, check_unchanged
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import RoleKeys, resolve_update_every
-from sb3_gac.base.update import Batch
+from sb3_gac.base.update import Batch, Metrics
 from sb3_gac.checks.arguments import COMMON_CHECKS, OFF_POLICY_CHECKS, ArgumentCheck, check_train_freq
 from sb3_gac.checks.entries import check_held_by
 from sb3_gac.checks.requirements import check_goals, check_rewards_of_goals
@@ -236,13 +237,20 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         :param n_envs: number of environments
         :return: action for the environments, and the same scaled to [-1, 1] for the buffer
         """
+        action, scaled_action = self._next_action(learning_starts, action_noise, n_envs)
+        self._behaviour_state = self.policy.with_actions(self._behaviour_state, scaled_action)
+        return action, scaled_action
+
+    def _next_action(
+        self, learning_starts: int, action_noise: ActionNoise | None, n_envs: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         warms_up = self.num_timesteps < learning_starts
         episode_starts = np.ones(n_envs, dtype=bool) if self._last_episode_starts is None else self._last_episode_starts
         if len(self.acting) != n_envs:
             self.begin_episodes(n_envs)
         self.acting = self.choose_acting(episode_starts)
         self._has_warmed_up |= warms_up
-        if warms_up and not self.is_recurrent:
+        if warms_up and not (self.is_recurrent or self.policy.remembers):
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, dict)
         trained = [self.policy.roles.behaviour if role in self.frozen else role for role in self.acting]
@@ -295,6 +303,25 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         tb_log_name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
+    @property
+    def history_length(self) -> int:
+        """Steps before each transition that the batches of the next gradient steps have, see ``Batch.histories``."""
+        return 0
+
+    @property
+    def at_rest(self) -> frozenset[str]:
+        """Networks that the next gradient steps leave as they are, whatever is minimised: those of another phase."""
+        return frozenset()
+
+    @abstractmethod
+    def update(self, batch: Batch) -> Metrics:
+        """
+        One gradient step of all networks and coefficients; targets follow by themselves.
+
+        :param batch: B transitions
+        :return: to log under "train/"
+        """
+
     # --- training ---------------------------------------------------------------------------------------------------
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -305,13 +332,17 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         if self._waits_for_an_episode():
             return
         update_every = resolve_update_every(self.policy.roles, self.policy_delay, self.update_every)
+        at_rest = self.at_rest
+        targets_follow = not set(self.policy.pairs) <= at_rest
         with self.gradient_steps_under_way() as history:
+            for name in at_rest:
+                getattr(self.policy, name).train(False)
             for _ in range(gradient_steps):
                 batch = self._sample_batch(batch_size)
-                self._resting = frozenset(name for name, every in update_every.items() if self._n_updates % every)
+                self._resting = at_rest.union(name for name, every in update_every.items() if self._n_updates % every)
                 history.append(self._compiled("update", self.update, batch) if self._is_one_program else self.update(batch))
                 self._n_updates += 1
-                if self._n_updates % self.target_update_interval == 0:
+                if targets_follow and self._n_updates % self.target_update_interval == 0:
                     self.policy.update_targets(self.tau)
 
     def _waits_for_an_episode(self) -> bool:
@@ -334,8 +365,14 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         return {**batch.observations, "reward": batch.rewards}
 
     def _sample_batch(self, batch_size: int) -> Batch:
-        assert self.replay_buffer is not None
-        samples = self.replay_buffer.sample(batch_size, env=self.sampling_env)
+        buffer, histories = self.replay_buffer, None
+        assert buffer is not None
+        samples: Any
+        if self.history_length:
+            assert isinstance(buffer, CompactDictReplayBuffer)
+            samples, histories = buffer.sample_with_histories(batch_size, self.history_length, env=self.sampling_env)
+        else:
+            samples = buffer.sample(batch_size, env=self.sampling_env)
         discounts = getattr(samples, "discounts", None)
         if discounts is None:
             discounts = th.full((), self.gamma, device=self.device)
@@ -351,6 +388,7 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
             samples.next_observations,
             samples.dones.flatten(),
             discounts.flatten() if discounts.dim() else discounts,
+            histories=histories,
         )
 
     def _excluded_save_params(self) -> list[str]:

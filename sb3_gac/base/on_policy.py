@@ -120,7 +120,7 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
     # --- training ---------------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def update(self, batch: DictRolloutBufferSamples) -> Metrics:  # type: ignore[override]
+    def update(self, batch: DictRolloutBufferSamples) -> Metrics:
         """
         One gradient step of all networks.
 

@@ -126,7 +126,7 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         self.reader = ObservationReader(observation_space)
         self.n_critics = n_critics
         self.share_features_extractor = share_features_extractor
-        self.role_keys = resolve_role_keys(observation_space, self.roles, role_keys)
+        self.role_keys = self.complete_role_keys(resolve_role_keys(observation_space, self.roles, role_keys))
         self._role_net_arch = resolve_net_arch(self.roles, self.net_arch)
         self._role_extractors = resolve_extractors(self.roles, features_extractor_class)
         self.rnn_types = resolve_rnn_types(self.roles, rnn_type or self.default_rnn_type)
@@ -141,6 +141,11 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         """Constructor arguments of a subclass, which it keeps before it calls this class's constructor."""
         return {}
 
+    @property
+    def remembers(self) -> bool:
+        """Whether a policy has a memory."""
+        return any(getattr(self, role).memory is not None for role in self.roles.policies)
+
     # --- networks ---------------------------------------------------------------------------------------------------
 
     def make_policy(self, role: str, **arguments: Any) -> RolePolicy:
@@ -149,6 +154,16 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         :param arguments: of its network
         """
         return Actor(**arguments)
+
+    def complete_role_keys(self, role_keys: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+        """
+        :param role_keys: network -> entries, as told or by default
+        :return: network -> entries that it is given
+        """
+        return role_keys
+
+    def tie_networks(self) -> None:
+        """Once all networks are made: for those that have layers in common."""
 
     def has(self, role: str) -> bool:
         """Whether there is a network for the role, which an ablation may do without."""
@@ -173,10 +188,16 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
 
         for role in self.roles.values:
             setattr(self, role, StateValue(**self._role_kwargs(role, shared)))
+        self.tie_networks()
         pairs = self.pairs.values()
         self._followed: list[th.Tensor] = [parameter for network, _ in pairs for parameter in network.parameters()]
         self._following: list[th.Tensor] = [parameter for _, target in pairs for parameter in target.parameters()]
         self._has_statistics = any(get_parameters_by_name(network, ["running_"]) for network, _ in pairs)
+
+    @property
+    def activation_fn(self) -> type[nn.Module]:
+        """Between layers."""
+        return self.constructor_options["activation_fn"]
 
     @property
     def _log_std_bounds(self) -> tuple[float, float]:
@@ -196,31 +217,42 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         """
         features_extractor, rest_extractor = shared, None
         if shared is None:
-            features_extractor = self._make_extractor(role, self.role_keys[role])
+            features_extractor = self.make_extractor(role, self.role_keys[role])
         else:
-            rest_extractor = self._make_extractor(role, self._keys_beside_the_deployed(role))
+            rest_extractor = self.make_extractor(role, self._keys_beside_the_deployed(role))
         extractors = [extractor for extractor in (features_extractor, rest_extractor) if extractor is not None]
         return {
             "observation_space": role_space(self.observation_space, self.role_keys[role]),  # type: ignore[arg-type]
             "action_space": self.action_space,
             "features_extractor": features_extractor,
             "rest_extractor": rest_extractor,
-            "activation_fn": self.constructor_options["activation_fn"],
+            "activation_fn": self.activation_fn,
             "normalize_images": self.normalize_images,
-            **self._body_kwargs(role, sum(extractor.features_dim for extractor in extractors)),
+            **self.body_arguments(role, sum(extractor.features_dim for extractor in extractors)),
         }
 
-    def _body_kwargs(self, role: str, features_dim: int) -> dict[str, Any]:
-        """What comes after a role's encoder: hidden layers, after a memory where the role has one."""
+    def body_arguments(self, role: str, features_dim: int) -> dict[str, Any]:
+        """
+        What comes after a role's encoder: hidden layers, after a memory where the role has one.
+
+        :param role: a network
+        :param features_dim: of its encoder
+        :return: arguments of the network
+        """
         net_arch, options, rnn_type = self._role_net_arch[role], self.constructor_options, self.rnn_types[role]
         if rnn_type is None:
             return {"features_dim": features_dim, "net_arch": net_arch}
         hidden_size = options["rnn_hidden_size"]
         members = self.n_critics if role in self.roles.critics else 1
-        memory = RecurrentCore(rnn_type, features_dim, net_arch, hidden_size, options["activation_fn"], members)
+        memory = RecurrentCore(rnn_type, features_dim, net_arch, hidden_size, self.activation_fn, members)
         return {"memory": memory, "features_dim": hidden_size, "net_arch": options["rnn_net_arch"]}
 
-    def _make_extractor(self, role: str, keys: Sequence[str]) -> BaseFeaturesExtractor:
+    def make_extractor(self, role: str, keys: Sequence[str]) -> BaseFeaturesExtractor:
+        """
+        :param role: a network
+        :param keys: entries that it reads
+        :return: its encoder of them
+        """
         space = role_space(self.observation_space, keys)  # type: ignore[arg-type]
         extractor = self._role_extractors[role]
         if extractor is not CombinedExtractor:
@@ -254,13 +286,15 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         if optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
             kwargs.setdefault("fused", True)
         lr_scales = resolve_lr_scales(self.roles, self.constructor_options["lr_scales"])
-        of_deployed = {
-            id(parameter) for parameter in self.deployed.parameters()
-        }  # with a shared encoder, whoever else holds it
         self.trained: dict[str, TrainedParameters] = {}
-        for role in (role for role in self.roles.all if getattr(self, role) is not None):
+        there = [role for role in self.roles.all if getattr(self, role) is not None]
+        owners: dict[int, str] = {}
+        for role in sorted(there, key=lambda role: role not in self.roles.parts):  # of what several hold, the first one
+            for parameter in getattr(self, role).parameters():
+                owners.setdefault(id(parameter), role)
+        for role in there:
             network = getattr(self, role)
-            own = [p for p in network.parameters() if role == self.roles.deployed or id(p) not in of_deployed]
+            own = [parameter for parameter in network.parameters() if owners[id(parameter)] == role]
             group = {"params": own, "lr_scale": lr_scales[role]}
             network.optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
             self.trained[role] = TrainedParameters(own, network.optimizer, self.unclipped(role))
@@ -376,7 +410,8 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         :param episode_start: true where an episode starts, shape (B,)
         :param deterministic: mode instead of a sample
         :param acting: role that acts in each environment; by default ``roles.behaviour``
-        :return: shape (B, \*action shape), and what recurrent policies remember, those that do not act as well
+        :return: shape (B, \*action shape), and what policies remember, those that do not act as well; but for the action that
+            is then taken, see :meth:`with_actions`
         """
         obs, _ = self._acting_reader.read(observation, self.device)
         names = self.roles.policies
@@ -390,6 +425,18 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
             rows = np.array([name == role for name in acting or ()])
             actions[rows] = self._chosen(policies[role], deterministic)[rows]
         return actions, None if all(remembered is None for remembered in after) else after
+
+    def with_actions(self, state: BehaviourState, actions: np.ndarray) -> BehaviourState:
+        r"""
+        :param state: what :meth:`behaviour_action` returned
+        :param actions: that were then taken, in [-1, 1] or one of a number, shape (B, \*action shape)
+        :return: what each policy remembers of both, for the next call
+        """
+        if state is None:
+            return None
+        return tuple(
+            getattr(self, role).with_action(own, actions) for role, own in zip(self.roles.policies, state, strict=True)
+        )
 
     @th.no_grad()
     def frozen_action(self, policy: nn.Module, observation: dict[str, np.ndarray]) -> np.ndarray:
@@ -452,7 +499,7 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         :param mode: True for training
         """
         for role in self.trained:
-            getattr(self, role).set_training_mode(mode)
+            getattr(self, role).train(mode)
         self.training = mode
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

@@ -29,6 +29,7 @@ class Roles(NamedTuple):
     :param unprivileged: those that see no more than the deployed policy, unless they are told to
     :param values: networks that value states, without targets
     :param collects: the policy that acts in training, by default the deployed one
+    :param parts: those parts of networks that an optimiser of their own trains, each an attribute of the policy
     """
 
     deployed: str
@@ -38,6 +39,7 @@ class Roles(NamedTuple):
     unprivileged: tuple[str, ...] = ()
     values: tuple[str, ...] = ()
     collects: str | None = None
+    parts: tuple[str, ...] = ()
 
     @property
     def policies(self) -> tuple[str, ...]:
@@ -46,23 +48,23 @@ class Roles(NamedTuple):
 
     @property
     def others(self) -> tuple[str, ...]:
-        """Every role but the deployed one."""
+        """Every network but the deployed one."""
         return (*self.actors, *self.critics, *self.values)
 
     @property
-    def all(self) -> tuple[str, ...]:
-        """Every role, the deployed one first."""
+    def networks(self) -> tuple[str, ...]:
+        """Every policy and critic, the deployed one first."""
         return (self.deployed, *self.others)
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """Whatever has an optimiser of its own: networks, the deployed one first, and parts of them."""
+        return (*self.networks, *self.parts)
 
     @property
     def behaviour(self) -> str:
         """The policy that collects the data."""
         return self.collects or self.deployed
-
-    @property
-    def names(self) -> list[str]:
-        """What a user may call them: every role, and "critic" for all critics."""
-        return list(dict.fromkeys([*self.all, CRITICS]))
 
 
 def check_observation_space(observation_space: spaces.Space) -> spaces.Dict:
@@ -91,18 +93,18 @@ def resolve_role_keys(
     :param observation_space: of the environment
     :param roles: of the algorithm
     :param role_keys: role, or "critic" for all critics -> entries, where they differ from the default
-    :return: role -> entries, for all roles
+    :return: role -> entries, for all networks
     :raises ValueError: if a role or an entry is unknown, an entry list is empty, or there is no ``partial`` entry
         for the deployed policy
     """
     entries = tuple(check_observation_space(observation_space).spaces)
-    role_keys = _check_roles("role_keys", roles, role_keys or {})
+    role_keys = _check_roles("role_keys", roles.networks, role_keys or {})
     if roles.deployed not in role_keys and PARTIAL not in entries:
         raise ValueError(
             f'The observation has no entry "{PARTIAL}" (its entries are {list(entries)}). Rename the entry that the '
             f'{roles.deployed} may see to "{PARTIAL}", or name it with role_keys={{"{roles.deployed}": ["<entry>"]}}.'
         )
-    resolved = dict.fromkeys(roles.all, entries) | {roles.deployed: (PARTIAL,)}
+    resolved = dict.fromkeys(roles.networks, entries) | {roles.deployed: (PARTIAL,)}
     resolved |= dict.fromkeys(roles.unprivileged, tuple(role_keys.get(roles.deployed, (PARTIAL,))))
     for name, keys in role_keys.items():
         if isinstance(keys, str) or not keys:
@@ -127,7 +129,7 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
     :param roles: of the algorithm
     :param net_arch: one list for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each policy and one
         for "critic"
-    :return: role -> sizes, for all roles
+    :return: role -> sizes, for all networks
     :raises ValueError: if the names are of neither form, or a size is no integer above 0
     """
     policies = roles.policies
@@ -143,7 +145,7 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
     for sizes in net_arch.values():
         for size in sizes:
             check_integer("net_arch: a layer's size", size, 1)
-    return {role: net_arch[role if role in policies else "critic"] for role in roles.all}
+    return {role: net_arch[role if role in policies else "critic"] for role in roles.networks}
 
 
 def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> dict[str, float]:
@@ -155,7 +157,7 @@ def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> di
     :return: role -> multiple, for all roles
     :raises ValueError: if a role is unknown or a multiple is not a number above 0
     """
-    lr_scales = _check_roles("lr_scales", roles, lr_scales or {})
+    lr_scales = _check_roles("lr_scales", roles.all, lr_scales or {})
     for role, scale in lr_scales.items():
         check_positive(f'lr_scales["{role}"]', scale)
     return dict.fromkeys(roles.all, 1.0) | _for_each_role(roles, lr_scales)
@@ -171,7 +173,7 @@ def resolve_update_every(roles: Roles, policy_delay: int, update_every: Mapping[
     :return: role -> gradient steps, for all roles
     :raises ValueError: if a role is unknown or a number is not a whole one above 0
     """
-    given = _check_roles("update_every", roles, update_every or {})
+    given = _check_roles("update_every", roles.all, update_every or {})
     for role, every in given.items():
         check_integer(f'update_every["{role}"]', every, 1)
     return dict.fromkeys(roles.all, 1) | dict.fromkeys(roles.policies, policy_delay) | _for_each_role(roles, given)
@@ -183,14 +185,15 @@ def resolve_rnn_types(roles: Roles, rnn_type: str | Mapping[str, str | None] | N
 
     :param roles: of the algorithm
     :param rnn_type: "gru", "lstm" or ``None`` for all roles, or role, or "critic" for all critics -> one of them
-    :return: role -> type, ``None`` for a network without a memory, for all roles
+    :return: role -> type, ``None`` for a network without a memory, for all networks
     :raises ValueError: if a role or a type is unknown
     """
-    given = _check_roles("rnn_type", roles, rnn_type if isinstance(rnn_type, Mapping) else dict.fromkeys(roles.all, rnn_type))
+    by_role = rnn_type if isinstance(rnn_type, Mapping) else dict.fromkeys(roles.networks, rnn_type)
+    given = _check_roles("rnn_type", roles.networks, by_role)
     for value in given.values():
         if value is not None:
             check_choice("rnn_type", value, CELLS)
-    return dict.fromkeys(roles.all) | _for_each_role(roles, given)
+    return dict.fromkeys(roles.networks) | _for_each_role(roles, given)
 
 
 def resolve_extractors(
@@ -201,19 +204,20 @@ def resolve_extractors(
 
     :param roles: of the algorithm
     :param extractor: one class for all roles, or role, or "critic" for all critics -> class, where it is not SB3's default
-    :return: role -> class, for all roles
+    :return: role -> class, for all networks
     :raises ValueError: if a role is unknown
     """
     if not isinstance(extractor, Mapping):
-        return dict.fromkeys(roles.all, extractor)
-    given = _check_roles("features_extractor_class", roles, extractor)
-    return dict.fromkeys(roles.all, CombinedExtractor) | _for_each_role(roles, given)
+        return dict.fromkeys(roles.networks, extractor)
+    given = _check_roles("features_extractor_class", roles.networks, extractor)
+    return dict.fromkeys(roles.networks, CombinedExtractor) | _for_each_role(roles, given)
 
 
-def _check_roles(name: str, roles: Roles, given: Mapping[str, T]) -> Mapping[str, T]:
-    unknown_roles = sorted(set(given) - {*roles.all, CRITICS})
+def _check_roles(name: str, roles: Sequence[str], given: Mapping[str, T]) -> Mapping[str, T]:
+    known = list(dict.fromkeys([*roles, CRITICS]))
+    unknown_roles = sorted(set(given) - set(known))
     if unknown_roles:
-        raise ValueError(f"{name} names unknown roles {unknown_roles}; the roles are {roles.names}.")
+        raise ValueError(f"{name} names unknown roles {unknown_roles}; the roles are {known}.")
     return given
 
 

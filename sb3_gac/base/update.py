@@ -19,6 +19,7 @@ from sb3_gac.networks.actors import RolePolicy
 from sb3_gac.optim.coefficients import Coefficient
 from sb3_gac.optim.compile import Program
 from sb3_gac.optim.parallel import Worker, worker
+from sb3_gac.replay.histories import Histories
 
 #: Name -> detached scalar, left on the device
 Metrics = dict[str, th.Tensor]
@@ -36,6 +37,7 @@ class Batch(NamedTuple):
     :param discounts: gamma to the number of steps that the reward sums up, scalar or shape (\*E)
     :param sequence: of sequences, observations and the last next one together, (T + 1, B, ...) of each entry
     :param mask: of sequences, 1 for what counts, 0 for padding and for what only brings memories up, shape (T, B)
+    :param histories: of transitions, what came before each, if the algorithm's ``history_length`` asks for it
     """
 
     observations: PyTorchObs
@@ -46,6 +48,7 @@ class Batch(NamedTuple):
     discounts: th.Tensor
     sequence: PyTorchObs | None = None
     mask: th.Tensor | None = None
+    histories: Histories | None = None
 
     def outputs(self, policy: RolePolicy) -> "Outputs":
         """
@@ -161,15 +164,6 @@ class GradientSteps(BaseAlgorithm):
     _last_metrics: Mapping[str, float] = MappingProxyType({})
 
     # --- what an algorithm writes, and what it writes it with ---------------------------------------------------------
-
-    @abstractmethod
-    def update(self, batch: Batch) -> Metrics:
-        """
-        One gradient step of all networks and coefficients; targets follow by themselves.
-
-        :param batch: B transitions
-        :return: to log under "train/"
-        """
 
     @_scheduled
     def minimize(self, networks: str | tuple[str, ...], loss: Callable[..., Loss], *tensors: Any) -> Metrics:
@@ -348,8 +342,10 @@ class GradientSteps(BaseAlgorithm):
         nothing = th.zeros((), device=self.device)
         sums = th.stack([th.stack([step.get(name, nothing) for name in counts]) for step in history]).sum(dim=0).tolist()
         values = {name: total / count for (name, count), total in zip(counts.items(), sums, strict=True)}
-        values["actor_loss"] = values[f"{self.policy.roles.deployed}_loss"]  # SB3's names for the two
-        values["critic_loss"] = sum(value for name, value in values.items() if name.endswith("critic_loss"))
+        if (of_deployed := f"{self.policy.roles.deployed}_loss") in values:  # SB3's names for the two
+            values["actor_loss"] = values[of_deployed]
+        if of_critics := [value for name, value in values.items() if name.endswith("critic_loss")]:
+            values["critic_loss"] = sum(of_critics)
         for name, value in values.items():
             self.logger.record(f"train/{name}", value)
         coefficients = {name: coefficient.value for name, coefficient in self.coefficients.items()}

@@ -117,7 +117,7 @@ class GPOPolicy(AsymmetricPolicy):
             )
         beside = [key for key in self.role_keys["guider"] if key not in self.role_keys["learner"]]
         space = role_space(self.observation_space, self.role_keys["guider"])  # type: ignore[arg-type]
-        return SharedGuider(self.learner, space, self._make_extractor("guider", beside) if beside else None)
+        return SharedGuider(self.learner, space, self.make_extractor("guider", beside) if beside else None)
 
     @property
     def actor(self) -> SharedLearner:
@@ -155,7 +155,7 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
 
     # --- algorithm ----------------------------------------------------------------------------------------------------
 
-    def update(self, batch: DictRolloutBufferSamples) -> Metrics:  # type: ignore[override]
+    def update(self, batch: DictRolloutBufferSamples) -> Metrics:
         """One step of all networks; policies share one, so their objectives are one loss."""
         noise = th.randn(*batch.actions.shape, device=self.device)
         coefficients = {name: coefficient.value for name, coefficient in self.coefficients.items()}

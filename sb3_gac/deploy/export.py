@@ -22,7 +22,7 @@ from sb3_gac.checks.values import check_positive, index_bounds
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import check_agreement, draw_observations
 from sb3_gac.networks.actors import DeployedPolicy
-from sb3_gac.networks.recurrent import RecurrentCore
+from sb3_gac.networks.recurrent import Memory
 from sb3_gac.version import __version__
 
 ACTION, STATE, NEXT_STATE = "action", "state", "next_state"
@@ -69,9 +69,9 @@ class DeployedModule(nn.Module):
         return self._free(f"{name}_") if name in self.keys else name
 
     @property
-    def memory(self) -> RecurrentCore | None:
-        """Of a recurrent policy."""
-        return self.policy.memory  # type: ignore[return-value]
+    def memory(self) -> Memory | None:
+        """Of a policy that has one."""
+        return self.policy.memory
 
     def forward(self, *inputs: th.Tensor) -> Any:
         """
@@ -86,7 +86,8 @@ class DeployedModule(nn.Module):
             {key: value[None] for key, value in obs.items()}, self.policy.features_extractor
         )
         outputs, after = self.memory(features, inputs[-1][None])
-        return self._in_range(self.policy.output(self.policy.latent_net(outputs[0, 0])).mode), after[0]
+        action = self.policy.output(self.policy.latent_net(outputs[0, 0])).mode
+        return self._in_range(action), self.memory.with_action(after[0], action)
 
     def _normalize(self, key: str, value: th.Tensor) -> th.Tensor:
         if key not in self.normalised:

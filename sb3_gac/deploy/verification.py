@@ -103,7 +103,7 @@ def _onnx_runner(path: Path, policy: DeployedPolicy, n: int) -> Callable[[Entrie
 
 def _torchscript_runner(path: Path, policy: DeployedPolicy, n: int) -> Callable[[Entries], np.ndarray]:
     module = th.jit.load(str(path))
-    state = [] if policy.memory is None else [th.zeros(n, policy.memory.state_size)]  # type: ignore[call-overload]
+    state = [] if policy.memory is None else [th.zeros(n, policy.memory.state_size)]
 
     def act(raw: Entries) -> np.ndarray:
         result = module(*(th.as_tensor(value) for value in raw.values()), *state)

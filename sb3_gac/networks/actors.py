@@ -14,6 +14,7 @@ from torch import nn
 from sb3_gac.checks.entries import ObservationReader, check_is_observation
 from sb3_gac.math.distributions import Distribution
 from sb3_gac.networks.heads import LOG_STD_BOUNDS, make_head
+from sb3_gac.networks.recurrent import Memory
 from sb3_gac.networks.role_model import RoleModel
 
 
@@ -61,7 +62,7 @@ class RolePolicy(RoleModel, BoundedPolicy):
         normalize_images: bool = True,
         rest_extractor: BaseFeaturesExtractor | None = None,
         log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
-        memory: nn.Module | None = None,
+        memory: Memory | None = None,
     ):
         super().__init__(
             observation_space,
@@ -118,16 +119,27 @@ class RolePolicy(RoleModel, BoundedPolicy):
         :param obs: observation with at least the entries of this role, (B, ...) of each
         :param state: what was remembered before, shape (B, S), or ``None``
         :param episode_start: true where an episode starts, shape (B,)
-        :return: as of :meth:`distribution`, shapes (B, A), and what is remembered now; ``None`` without a memory
+        :return: as of :meth:`distribution`, shapes (B, A), and what is remembered now, but for the action, see
+            :meth:`with_action`; ``None`` without a memory
         """
         if self.memory is None:
             return self.distribution(obs), None
         assert isinstance(obs, dict)
         one_step = {key: value[None] for key, value in obs.items()}
         features = self.extract_features(one_step, self.features_extractor)
-        before = self.memory.state_before(state, episode_start, features.shape[1])  # type: ignore[operator]
+        before = self.memory.state_before(state, episode_start, features.shape[1])
         outputs, after = self.memory(features, before)
         return self.output(self.latent_net(outputs[0, 0])), after[0].detach().cpu().numpy()
+
+    def with_action(self, state: np.ndarray | None, actions: np.ndarray) -> np.ndarray | None:
+        r"""
+        :param state: what :meth:`remember` returned
+        :param actions: that were then taken, in [-1, 1], shape (B, \*action shape), or numbers of actions
+        :return: what is remembered of both, for the next step
+        """
+        if self.memory is None or state is None:
+            return state
+        return self.memory.with_action(th.as_tensor(state), th.as_tensor(actions)).numpy()
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {
@@ -188,6 +200,7 @@ class DeployedPolicy(RolePolicy):
             actions, after = self.remember(obs, None if state is None else state[0], episode_start)
         chosen = actions.mode if deterministic else actions.sample()
         action = chosen.cpu().numpy().reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+        after = self.with_action(after, action)
         if isinstance(self.action_space, spaces.Box):
             action = self.unscale_action(action)
         assert after is not None

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_gac.networks.layers import EnsembleHead, EnsembleInput, EnsembleLinear, EnsembleOutput
+from sb3_gac.networks.recurrent import Memory
 from sb3_gac.networks.role_model import RoleModel
 
 
@@ -44,7 +45,7 @@ class CriticEnsemble(RoleModel):
         normalize_images: bool = True,
         rest_extractor: BaseFeaturesExtractor | None = None,
         n_critics: int = 2,
-        memory: nn.Module | None = None,
+        memory: Memory | None = None,
     ):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images

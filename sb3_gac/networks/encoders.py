@@ -1,15 +1,16 @@
 """Encoders of observation entries: what SB3's CombinedExtractor does, cheaper for vectors, and for entries of any name."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN, create_mlp
 from torch import nn
 
 from sb3_gac.checks.entries import encoded_size
+from sb3_gac.networks.layers import Head
 
 SMALLEST_IMAGE = 36  # pixels of each side that SB3's NatureCNN leaves something of
 
@@ -69,6 +70,61 @@ class EntryExtractor(CombinedExtractor):
         :return: shape (B, F)
         """
         return th.cat([self.extractors[name](observations[key]) for key, name in self._names.items()], dim=1)
+
+
+class LatentExtractor(BaseFeaturesExtractor):
+    """
+    Entries, in a few numbers from -1 to 1: tanh of a network on their features.
+
+    :param extractor: of the entries
+    :param net_arch: hidden layer sizes
+    :param latent_dim: L
+    :param activation_fn: between layers
+    """
+
+    def __init__(
+        self,
+        extractor: BaseFeaturesExtractor,
+        net_arch: Sequence[int],
+        latent_dim: int,
+        activation_fn: type[nn.Module] = nn.SiLU,
+    ):
+        super().__init__(extractor._observation_space, latent_dim)
+        self.extractor = extractor
+        self.net = nn.Sequential(*create_mlp(extractor.features_dim, -1, list(net_arch), activation_fn))
+        self.output = Head([extractor.features_dim, *net_arch][-1], latent_dim)
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        """
+        :param observations: these entries, (B, ...) each
+        :return: shape (B, L)
+        """
+        return th.tanh(self.output(self.net(self.extractor(observations))))
+
+
+class JoinedExtractor(BaseFeaturesExtractor):
+    """
+    Features of several extractors side by side.
+
+    :param extractors: each of entries of its own, which others may have as well
+    """
+
+    def __init__(self, extractors: Sequence[BaseFeaturesExtractor]):
+        entries = {key: space for each in extractors for key, space in _entries_of(each).items()}
+        super().__init__(spaces.Dict(entries), sum(each.features_dim for each in extractors))
+        self.extractors = nn.ModuleList(extractors)
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        """
+        :param observations: all of these entries, (B, ...) each
+        :return: shape (B, F)
+        """
+        features = [each({key: observations[key] for key in _entries_of(each)}) for each in self.extractors]
+        return th.cat(features, dim=-1)
+
+
+def _entries_of(extractor: nn.Module) -> dict[str, spaces.Space]:
+    return extractor._observation_space.spaces  # type: ignore[union-attr, return-value]
 
 
 def module_names(keys: Iterable[str]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""What networks remember of a sequence: hidden layers and a recurrent cell, before the rest of the network."""
+"""What networks remember: of a sequence by hidden layers and a recurrent cell, before the rest of the network."""
 
 import itertools
 from typing import Any
@@ -10,7 +10,45 @@ from torch import nn
 from sb3_gac.networks.layers import EnsembleLinear
 
 
-class RecurrentCore(nn.Module):
+class Memory(nn.Module):
+    """What a network remembers from one step to the next: a row of numbers each, zeros at an episode's start."""
+
+    #: Numbers in a row, S
+    state_size: int
+
+    def state_before(self, state: np.ndarray | None, episode_start: np.ndarray | None, batch: int) -> th.Tensor:
+        """
+        :param state: as the last :meth:`forward` left it, shape (B, S), or ``None``
+        :param episode_start: true where an episode starts, which is without a memory, shape (B,)
+        :param batch: B
+        :return: shape (1, B, S)
+        :raises ValueError: if ``state`` or ``episode_start`` is of another number of observations
+        """
+        for name, given in (("state", state), ("episode_start", episode_start)):
+            if given is not None and len(given) != batch:
+                raise ValueError(
+                    f"{name} is of {len(given)} observations, but predict() was given {batch}: pass the state that the last "
+                    "predict() returned, and one episode_start for each observation."
+                )
+        device = next(self.parameters()).device
+        if state is None:
+            return th.zeros(1, batch, self.state_size, device=device)
+        kept = th.as_tensor(np.array(state, dtype=np.float32), device=device).reshape(1, batch, self.state_size)
+        if episode_start is None:
+            return kept
+        goes_on = 1.0 - th.as_tensor(np.array(episode_start, dtype=np.float32), device=device).reshape(1, batch, 1)
+        return kept * goes_on
+
+    def with_action(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        :param state: as a step of acting left it, shape (B, S)
+        :param actions: that were then taken, in [-1, 1], shape (B, \\*action shape), or numbers of actions
+        :return: what is remembered of both; by a memory of observations alone, the same
+        """
+        return state
+
+
+class RecurrentCore(Memory):
     """
     Hidden layers and then one recurrent layer, for each member of an ensemble; the layers are batched over members, each
     recurrent layer takes one pass over time.
@@ -70,29 +108,6 @@ class RecurrentCore(nn.Module):
             return outputs, last[0]
         outputs, (hidden, inner) = cell(x, tuple(part[None].contiguous() for part in state.chunk(2, dim=-1)))
         return outputs, th.cat([hidden[0], inner[0]], dim=-1)
-
-    def state_before(self, state: np.ndarray | None, episode_start: np.ndarray | None, batch: int) -> th.Tensor:
-        """
-        :param state: as the last :meth:`forward` left it, shape (B, S), or ``None``
-        :param episode_start: true where an episode starts, which is without a memory, shape (B,)
-        :param batch: B
-        :return: shape (1, B, S)
-        :raises ValueError: if ``state`` or ``episode_start`` is of another number of observations
-        """
-        for name, given in (("state", state), ("episode_start", episode_start)):
-            if given is not None and len(given) != batch:
-                raise ValueError(
-                    f"{name} is of {len(given)} observations, but predict() was given {batch}: pass the state that the last "
-                    "predict() returned, and one episode_start for each observation."
-                )
-        device = next(self.parameters()).device
-        if state is None:
-            return th.zeros(1, batch, self.state_size, device=device)
-        kept = th.as_tensor(np.array(state, dtype=np.float32), device=device).reshape(1, batch, self.state_size)
-        if episode_start is None:
-            return kept
-        goes_on = 1.0 - th.as_tensor(np.array(episode_start, dtype=np.float32), device=device).reshape(1, batch, 1)
-        return kept * goes_on
 
 
 CELLS: dict[str, Any] = {"gru": nn.GRU, "lstm": nn.LSTM}

@@ -5,17 +5,17 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
-from torch import nn
 
 from sb3_gac.checks.entries import encode, leading_dimensions
 from sb3_gac.networks.encoders import VectorExtractor
+from sb3_gac.networks.recurrent import Memory
 
 
 class RoleModel(BaseModel):
     """
     A network that reads only the observation entries of its role, whatever else the observation holds.
 
-    With a ``memory`` (:class:`sb3_gac.networks.recurrent.RecurrentCore`) it needs sequences from an episode's start on,
+    With a ``memory`` (:class:`sb3_gac.networks.recurrent.Memory`) it needs sequences from an episode's start on,
     (T, B, ...) of each entry instead of (B, ...); without one it takes either.
 
     Where the learner's encoder is shared, ``features_extractor`` is the learner's, which the learner's loss alone
@@ -23,7 +23,7 @@ class RoleModel(BaseModel):
     """
 
     rest_extractor: BaseFeaturesExtractor | None
-    memory: nn.Module | None
+    memory: Memory | None
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         """

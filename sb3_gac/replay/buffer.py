@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gac.checks.entries import computable
+from sb3_gac.replay.histories import Histories, steps_before, unbroken
 from sb3_gac.replay.observation_store import FinalObservations, ObservationLayout, Rows
 
 DONE, TIME_LIMIT, CUT = 1, 2, 4
@@ -37,6 +38,9 @@ class CompactDictReplayBuffer(DictReplayBuffer):
     :param storage_dtype: "float16" to store floating-point entries at half precision
     :raises MemoryError: if the buffer can't fit into the memory that is available
     """
+
+    #: Transitions that are not sampled any more, per environment, of all that were ever added
+    _n_retired = 0
 
     def __init__(
         self,
@@ -107,7 +111,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
     def reset(self) -> None:
         """Forget everything."""
         super().reset()
-        self._n_added = 0
+        self._n_added = self._n_retired = 0
         self._finals = FinalObservations(self.layout)
         self.endings[:] = 0
 
@@ -124,7 +128,8 @@ class CompactDictReplayBuffer(DictReplayBuffer):
 
     def bookkeeping(self) -> dict[str, Any]:
         """All else that there is, for :meth:`restore_bookkeeping`."""
-        return {"n_added": self._n_added, "shape": list(self.rewards.shape), "finals": self._finals.state()}
+        counts = {"n_added": self._n_added, "n_retired": self._n_retired}
+        return {**counts, "shape": list(self.rewards.shape), "finals": self._finals.state()}
 
     def restore_bookkeeping(self, state: dict[str, Any]) -> None:
         """
@@ -133,7 +138,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         """
         if state["shape"] != list(self.rewards.shape):
             raise ValueError(f"The buffer has (rows, environments) {list(self.rewards.shape)}, and had {state['shape']}.")
-        self._n_added = state["n_added"]
+        self._n_added, self._n_retired = state["n_added"], state.get("n_retired", 0)
         self.pos = self._n_added % self.n_rows
         self.full = self._n_added >= self.buffer_size
         self._finals.restore(state["finals"])
@@ -184,6 +189,10 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         if self._n_added:
             self._cut(np.ones(self.n_envs, dtype=bool))
 
+    def retire(self) -> None:
+        """What is stored is not sampled from now on; it stays the history of what is to come."""
+        self._n_retired = self._n_added
+
     def _cut_what_does_not_continue(self, rows: Rows) -> None:
         """Where an episode goes on from another observation than it reached, someone did not say so."""
         self._cut(np.any([np.any(rows[group] != values[self.pos], axis=1) for group, values in self._rows.items()], axis=0))
@@ -209,13 +218,37 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         :param env: normalises observations and rewards
         :return: tensors on the buffer's device, (B, ...) each
         """
-        steps = np.random.randint(self._n_added - self.size(), self._n_added, size=batch_size)
-        return self._get_samples(steps % self.n_rows, env)
+        return self._get_samples(self._draw_steps(batch_size) % self.n_rows, env)
+
+    def sample_with_histories(
+        self, batch_size: int, length: int, env: VecNormalize | None = None
+    ) -> tuple[DictReplayBufferSamples, Histories]:
+        """
+        :param batch_size: see :meth:`sample`
+        :param length: steps before each transition, K
+        :param env: see :meth:`sample`
+        :return: what :meth:`sample` draws, and what came before in the episodes, as far as it is stored
+        """
+        steps = self._draw_steps(batch_size)
+        envs = np.random.randint(self.n_envs, size=batch_size)
+        return self._transitions(steps % self.n_rows, envs, env), self._histories(steps, envs, length, env)
+
+    @property
+    def _first_sampled(self) -> int:
+        """The oldest step that is stored and not retired."""
+        return max(self._n_added - self.size(), self._n_retired)
+
+    def _draw_steps(self, batch_size: int) -> np.ndarray:
+        if self._first_sampled == self._n_added:
+            raise ValueError("The replay buffer holds nothing to sample: add transitions first, after retire() new ones.")
+        return np.random.randint(self._first_sampled, self._n_added, size=batch_size)
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
     ) -> DictReplayBufferSamples:
-        envs = np.random.randint(self.n_envs, size=len(batch_inds))
+        return self._transitions(batch_inds, np.random.randint(self.n_envs, size=len(batch_inds)), env)
+
+    def _transitions(self, batch_inds: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> DictReplayBufferSamples:
         rewards, last, discounts = self._n_step_rewards(batch_inds, envs, env)
         endings = self.endings[last, envs]
         terminated = (endings & (DONE | TIME_LIMIT)) == DONE
@@ -226,6 +259,23 @@ class CompactDictReplayBuffer(DictReplayBuffer):
             dones=self.to_torch(terminated.astype(np.float32)[:, None], copy=False),
             rewards=self.to_torch(rewards[:, None], copy=False),
             discounts=None if discounts is None else self.to_torch(discounts[:, None], copy=False),
+        )
+
+    def _histories(self, steps: np.ndarray, envs: np.ndarray, length: int, env: VecNormalize | None) -> Histories:
+        before = steps_before(steps, length)
+        rows = before % self.n_rows
+        valid = unbroken((before >= self._n_added - self.size()) & (self.endings[rows, envs] == 0))
+        mask = self.to_torch(valid.astype(np.float32), copy=False)
+        entries = self._to_tensors(self._gather(rows.ravel(), np.broadcast_to(envs, rows.shape).ravel()), env)
+        actions = self.actions[rows, envs] * valid[..., None].astype(self.actions.dtype)
+        observations = {key: entry.unflatten(0, rows.shape) for key, entry in entries.items()}
+        return Histories(
+            {
+                key: entry * mask.view(*rows.shape, *[1] * (entry.dim() - 2)).to(entry.dtype)
+                for key, entry in observations.items()
+            },
+            self.to_torch(actions, copy=False),
+            mask,
         )
 
     def _n_step_rewards(

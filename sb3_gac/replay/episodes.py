@@ -146,7 +146,7 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         return len(self._whole_episodes())
 
     def _whole_episodes(self) -> np.ndarray:
-        return self._episodes.since(self._n_added - self.size())
+        return self._episodes.since(self._first_sampled)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceSamples:  # type: ignore[override]
         """

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC
+from sb3_gac import GAC, RMA, TGRL, AsymmetricSAC
 from tests.helpers import Recall, Sampled, TwoViewBandit, small_model
 
 
@@ -205,6 +205,28 @@ def test_bad_settings_of_roles_are_named(arguments, message):
         small_model(**arguments)
 
 
+class OnlyTheActor(AsymmetricSAC):
+    """Leaves its critics as they are, once it is told to."""
+
+    at_rest = frozenset()
+
+    def update(self, batch):
+        self.training = {role: getattr(self.policy, role).training for role in ("actor", "critic")}
+        return super().update(batch)
+
+
+def test_networks_at_rest_stay_as_they_are():
+    """To the bit, whatever is minimised, with targets and in evaluation mode."""
+    model = small_model(cls=OnlyTheActor, learning_rate=0.1).learn(14)
+    assert model.training == {"actor": True, "critic": True}
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.at_rest = frozenset(["critic"])
+    model.learn(6, reset_num_timesteps=False)
+    moved = {name.split(".")[0] for name, value in model.policy.state_dict().items() if not th.equal(value, before[name])}
+    assert moved == {"actor"}
+    assert model.training == {"actor": True, "critic": False}
+
+
 # --- networks by role ----------------------------------------------------------------------------------------------
 
 
@@ -257,6 +279,6 @@ def test_two_networks_may_share_a_loss():
 
 def test_every_algorithm_collects_with_its_own():
     teacher = small_model(Sampled(TwoViewBandit().observation_space), AsymmetricSAC)
-    behaviours = {cls: cls.policy_aliases["MultiInputPolicy"].roles.behaviour for cls in (GAC, AsymmetricSAC, TGRL)}
-    assert behaviours == {GAC: "guider", AsymmetricSAC: "actor", TGRL: "actor"}
+    behaviours = {cls: cls.policy_aliases["MultiInputPolicy"].roles.behaviour for cls in (GAC, AsymmetricSAC, TGRL, RMA)}
+    assert behaviours == {GAC: "guider", AsymmetricSAC: "actor", TGRL: "actor", RMA: "expert"}
     assert teacher.policy.roles.behaviour == "actor"

@@ -18,7 +18,7 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, CheckpointError, GACShare
+from sb3_gac import GAC, RMA, AsymmetricSAC, CheckpointError, GACShare
 from sb3_gac.envs import SensorNoise
 from sb3_gac.replay.buffer import CUT
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
@@ -56,6 +56,8 @@ CASES = {  # name -> environment, algorithm and arguments
     "asymmetric SAC": (lambda: _bandits(3), AsymmetricSAC, {"gradient_steps": 2}),
     "discrete": (lambda: _bandits(2, TwoViewChoice), GAC, {}),
     "recurrent": (lambda: DummyVecEnv([Recall] * 2), GAC, GRU),
+    "two phases": (lambda: _bandits(2), RMA, {"history": 4, "buffer_size": 100}),
+    "two phases, discrete": (lambda: _bandits(1, TwoViewChoice), RMA, {"history": 1, "phase_1_steps": N}),
     "warm-up": (_bandits, GAC, {"learning_starts": N + 20}),
 }
 

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_gac import COSIL, GAC, TGRL, AsymmetricSAC
+from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricSAC
 from sb3_gac.optim.compile import Program
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
 
@@ -36,7 +36,7 @@ def _assert_equal(model, other, **tolerance):
         th.testing.assert_close(coefficient.value, other.coefficients[name].value, **tolerance)
 
 
-@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL, COSIL])
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL, COSIL, RMA])
 def test_compiled_training_is_plain_training(cls, tmp_path):
     """Through other batch sizes and settings, new weights, a copy of the policy and a save: nothing stale is used."""
     plain, compiled = _filled(cls), _filled(cls, compile=True)
@@ -62,6 +62,17 @@ def test_compiled_training_is_plain_training(cls, tmp_path):
     assert loaded.compile
     _train((plain, loaded), batch_size=8)
     _assert_equal(plain, loaded, rtol=1e-4, atol=1e-6)
+
+
+def test_each_phase_is_a_program_of_its_own():
+    """And what rests in one of them stays as it is."""
+    plain, compiled = _filled(RMA, history=7), _filled(RMA, history=7, compile=True)
+    for phase in (1, 2, 1):
+        for model in (plain, compiled):
+            model.phase = phase
+        _train((plain, compiled))
+        _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
+    assert len(compiled.programs) == 2
 
 
 IMAGES = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=spaces.Box(-1, 1, (2,), np.float32))
