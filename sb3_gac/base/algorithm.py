@@ -10,12 +10,13 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from sb3_gac.base.acting import BehaviourState
 from sb3_gac.base.arguments import ConstructorArguments, present_names
 from sb3_gac.base.faults import FaultTolerance
 from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
 from sb3_gac.base.hooks import EpisodeHooks
 from sb3_gac.base.overrides import algorithm_of
-from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
+from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.resuming import ResumableAlgorithm
 from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_rnn_types, resolve_role_keys
 from sb3_gac.base.strict_predict import DeploymentGuard

@@ -4,7 +4,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_gac.base.policy import AsymmetricPolicy, BehaviourState
+from sb3_gac.base.acting import BehaviourState
+from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.entries import check_is_observation
 
 

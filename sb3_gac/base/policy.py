@@ -2,22 +2,21 @@
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
+from sb3_gac.base.acting import ActingPolicy
 from sb3_gac.base.arguments import ConstructorArguments
 from sb3_gac.base.roles import (
     DEFAULT_NET_ARCH,
     RoleKeys,
-    Roles,
     resolve_extractors,
     resolve_lr_scales,
     resolve_net_arch,
@@ -27,8 +26,7 @@ from sb3_gac.base.roles import (
 )
 from sb3_gac.checks.entries import ObservationReader
 from sb3_gac.checks.values import check_integer
-from sb3_gac.math.distributions import Distribution
-from sb3_gac.networks.actors import Actor, BoundedPolicy, DeployedPolicy, RolePolicy
+from sb3_gac.networks.actors import Actor, RolePolicy
 from sb3_gac.networks.critics import CriticEnsemble, DiscreteCriticEnsemble
 from sb3_gac.networks.encoders import EntryExtractor, VectorExtractor
 from sb3_gac.networks.heads import LOG_STD_BOUNDS
@@ -37,11 +35,8 @@ from sb3_gac.networks.values import StateValue
 from sb3_gac.optim.polyak import polyak_average
 from sb3_gac.optim.trained import TrainedParameters
 
-#: What each policy's network remembers, shapes (B, S), ``None`` without a memory; ``None`` before the first step
-BehaviourState: TypeAlias = tuple[np.ndarray | None, ...] | None
 
-
-class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
+class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
     """
     The networks of an algorithm's ``roles``, each reading the observation entries of its role, and their optimisers.
 
@@ -72,7 +67,6 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
     :param rnn_net_arch: of recurrent networks: hidden layer sizes after the recurrent layer
     """
 
-    roles: ClassVar[Roles]
     #: Default of the argument of that name
     default_rnn_type: ClassVar[str | None] = None
 
@@ -334,15 +328,15 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
                 getattr(self, role).optimizer.param_groups[0]["lr_scale"] = scale
 
     @property
-    def deployed(self) -> DeployedPolicy:
-        """The policy that acts at evaluation."""
-        return getattr(self, self.roles.deployed)
-
-    @property
     def pairs(self) -> dict[str, tuple[BaseModel, BaseModel]]:
         """Role -> (network, target), for each network that has one."""
         roles = (role for role in self.roles.all if getattr(self, f"{role}_target", None) is not None)
         return {role: (getattr(self, role), getattr(self, f"{role}_target")) for role in roles}
+
+    @property
+    def side_branch(self) -> tuple[str, ...]:
+        """Networks whose gradient steps read nothing that those of the others change, and change nothing that those read."""
+        return ()
 
     def update_targets(self, tau: float) -> None:
         """
@@ -353,144 +347,6 @@ class AsymmetricPolicy(ConstructorArguments, BoundedPolicy):
         polyak_average(self._followed, self._following, tau)
         for network, target in self.pairs.values() if self._has_statistics else ():  # a move to another device replaces them
             polyak_average(get_parameters_by_name(network, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
-
-    # --- acting -----------------------------------------------------------------------------------------------------
-
-    @property
-    def side_branch(self) -> tuple[str, ...]:
-        """Networks whose gradient steps read nothing that those of the others change, and change nothing that those read."""
-        return ()
-
-    def check_seen_by(self, role: str, observation: Any, where: str) -> None:
-        """
-        :param role: that is about to act
-        :param observation: that it was handed
-        :param where: the method that was called, for the message
-        :raises ValueError: if an entry is missing that the role or, because it acts beside it, the deployed policy reads
-        """
-        reads = list(dict.fromkeys([*self.role_keys[role], *self.role_keys[self.roles.deployed]]))
-        if not isinstance(observation, Mapping):
-            raise ValueError(f"The {role} reads {reads}: pass {where} a dict with these entries, not an array.")
-        missing = [key for key in reads if key not in observation]
-        if missing:
-            raise ValueError(
-                f"The observation passed to {where} lacks {missing}, which the {role} reads; it has {list(observation)}. "
-                f"predict() is for observations of {list(self.role_keys[self.roles.deployed])} alone."
-            )
-
-    def acting_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:
-        """
-        :param outputs: role -> what its network computed, for each policy
-        :return: role -> distribution of its actions
-        """
-        return outputs
-
-    def behaviour_distribution(self, obs: PyTorchObs) -> Distribution:
-        r"""
-        :param obs: full observation, (\*E, ...) of each entry
-        :return: distribution of the actions of the policy that collects the data, shapes (\*E, A)
-        """
-        outputs = {role: getattr(self, role).distribution(obs) for role in self.roles.policies}
-        return self.acting_distributions(outputs)[self.roles.behaviour]
-
-    @th.no_grad()
-    def behaviour_action(
-        self,
-        observation: dict[str, np.ndarray],
-        state: BehaviourState = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-        acting: Sequence[str] | None = None,
-    ) -> tuple[np.ndarray, BehaviourState]:
-        r"""
-        Action of the policies that collect the data, in [-1, 1] or one of a number.
-
-        :param observation: full observation, B of each entry
-        :param state: what the last call returned, ``None`` at the start
-        :param episode_start: true where an episode starts, shape (B,)
-        :param deterministic: mode instead of a sample
-        :param acting: role that acts in each environment; by default ``roles.behaviour``
-        :return: shape (B, \*action shape), and what policies remember, those that do not act as well; but for the action that
-            is then taken, see :meth:`with_actions`
-        """
-        obs, _ = self._acting_reader.read(observation, self.device)
-        names = self.roles.policies
-        before = state or (None,) * len(names)
-        steps = [getattr(self, name).remember(obs, own, episode_start) for name, own in zip(names, before, strict=True)]
-        policies = self.acting_distributions(dict(zip(names, (output for output, _ in steps), strict=True)))
-        after = tuple(remembered for _, remembered in steps)
-        roles = list(dict.fromkeys(acting if acting is not None else [self.roles.behaviour]))
-        actions = self._chosen(policies[roles[0]], deterministic)
-        for role in roles[1:]:
-            rows = np.array([name == role for name in acting or ()])
-            actions[rows] = self._chosen(policies[role], deterministic)[rows]
-        return actions, None if all(remembered is None for remembered in after) else after
-
-    def with_actions(self, state: BehaviourState, actions: np.ndarray) -> BehaviourState:
-        r"""
-        :param state: what :meth:`behaviour_action` returned
-        :param actions: that were then taken, in [-1, 1] or one of a number, shape (B, \*action shape)
-        :return: what each policy remembers of both, for the next call
-        """
-        if state is None:
-            return None
-        return tuple(
-            getattr(self, role).with_action(own, actions) for role, own in zip(self.roles.policies, state, strict=True)
-        )
-
-    @th.no_grad()
-    def frozen_action(self, policy: nn.Module, observation: dict[str, np.ndarray]) -> np.ndarray:
-        r"""
-        :param policy: that is no network of this one's, see :class:`sb3_gac.base.frozen.FrozenPolicy`
-        :param observation: full observation, B of each entry
-        :return: a sample of its actions, in [-1, 1] or of a number, shape (B, \*action shape)
-        """
-        obs, _ = self.reader.read(observation, self.device)
-        return self._chosen(policy(obs), deterministic=False)
-
-    def _chosen(self, actions: Distribution, deterministic: bool) -> np.ndarray:
-        r"""
-        :param actions: shapes (B, A)
-        :param deterministic: mode instead of a sample
-        :return: shape (B, \*action shape)
-        """
-        chosen = actions.mode if deterministic else actions.sample()
-        return chosen.cpu().numpy().reshape(-1, *self.action_space.shape)  # type: ignore[misc]
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        The deployed policy's action; entries that it does not read are ignored.
-
-        :param observation: single or batched; ``{"partial": ...}``, a full dict, or the partial entry alone
-        :param state: what a recurrent policy's last call returned, ``None`` at the start
-        :param episode_start: true where an episode starts, shape (B,)
-        :param deterministic: mode instead of a sample
-        :return: action in the environment's range, and the state for the next call
-        """
-        return self.deployed.predict(observation, state, episode_start, deterministic)
-
-    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """The deployed policy's action, in [-1, 1] of shape (B, A), or one of a number of shape (B,)."""
-        return self._predict(obs, deterministic)
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self.deployed._predict(observation, deterministic)
-
-    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
-        """
-        :param observation: dict of observation entries, single or batched; unknown entries are dropped
-        :return: tensors, and whether they were batched
-        :raises ValueError: naming the entry that does not fit its space, or is not as many as the others
-        """
-        if not isinstance(observation, Mapping):
-            return self.deployed.obs_to_tensor(observation)
-        return self.reader.read(observation, self.device)
 
     def set_training_mode(self, mode: bool) -> None:
         """
