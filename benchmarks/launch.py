@@ -31,7 +31,7 @@ from rich.text import Text
 from benchmarks.config import check_runs
 from benchmarks.engines import Engine, LocalEngine, RayEngine
 from benchmarks.finished import add_reuse_options, name_of, read_reused
-from benchmarks.run import model_of
+from benchmarks.run import file_for
 from benchmarks.suite import RUNS, RunSpec, needed_runs, read_suite
 
 COLUMNS = ("task", "noise", "algorithm", "seed", "state", "steps", "return")
@@ -110,14 +110,15 @@ def _add_job(
         needs = [
             _add_job(jobs, other, command, runs, (*needed, argument))
             for argument, other in needed_runs(spec).items()
-            if not _has_model(other, runs)
+            if not _has_left(argument, other, runs)
         ]
         jobs[name] = Job(spec, spec.directory(runs), command(needed), needs=needs)
     return jobs[name]
 
 
-def _has_model(spec: RunSpec, runs: Path) -> bool:
-    return spec.is_finished(runs) and model_of(spec, runs).exists()
+def _has_left(argument: str, spec: RunSpec, runs: Path) -> bool:
+    """Whether a run is finished, and what another one needs of it is there."""
+    return spec.is_finished(runs) and file_for(argument, spec, runs).exists()
 
 
 def run_command(suite: Path, index: int, runs: Path, needed: Sequence[str] = ()) -> list[str]:

@@ -32,10 +32,12 @@ from benchmarks.checkpoint import checkpoints_of, locked, write_atomically
 from benchmarks.config import POLICY, in_present_names, normalization, resolve, settings_in_present_names
 from benchmarks.environments import make_envs, normalized
 from benchmarks.suite import HERE, RUNS, RunSpec, made_with, needed_runs, read_suite
+from sb3_gac.base.recording import holds_every_step
 from sb3_gac.presets import instantiate
 
 EVAL_SEED = 10_000
-CONFIGURATION, MODEL, STATISTICS = "config.yaml", "model.zip", "vecnormalize.pkl"
+CONFIGURATION, MODEL = "config.yaml", "model.zip"
+STATISTICS, RECORDING = "vecnormalize.pkl", "recording.npz"
 
 
 def provenance() -> dict[str, Any]:
@@ -64,10 +66,10 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     directory = spec.directory(root)
     if spec.is_finished(root):
         return directory
-    models = {argument: str(model_of(needed, root)) for argument, needed in needed_runs(spec).items()}
+    algorithm_class, arguments = resolve(spec)
+    models = {argument: str(file_for(argument, needed, root)) for argument, needed in needed_runs(spec).items()}
     directory.mkdir(parents=True, exist_ok=True)
     with locked(directory):
-        algorithm_class, arguments = resolve(spec)
         configuration = {"run": dataclasses.asdict(spec), "arguments": arguments}
         if (options := normalization(spec)) is not None:
             configuration["normalize"] = options
@@ -78,14 +80,14 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     return directory
 
 
-def model_of(spec: RunSpec, root: Path) -> Path:
+def file_for(argument: str, spec: RunSpec, root: Path) -> Path:
     """
-    :param spec: of a run that another one needs
+    :param argument: of a run that needs another one: ``recording`` is what that one has recorded, any other its model
+    :param spec: of the other run
     :param root: directory of all runs
-    :return: its model as it was in the end
     :raises ValueError: if it is not there
     """
-    path = spec.directory(root) / MODEL
+    path = spec.directory(root) / (RECORDING if argument == "recording" else MODEL)
     if not spec.is_finished(root):
         raise ValueError(f"{path.parent} is needed, and not finished: run it first, as benchmarks.launch does.")
     if not path.exists():
@@ -177,6 +179,8 @@ def _train(
     left = spec.steps - model.num_timesteps
     model.learn(left, callback=callbacks, reset_num_timesteps=False, progress_bar=progress_bar)
     model.save(directory / MODEL)
+    if holds_every_step(getattr(model, "replay_buffer", None)):
+        sb3_gac.write_recording(model, directory / RECORDING)
     if isinstance(env, VecNormalize):
         env.save(str(directory / STATISTICS))
     stopwatch.write()

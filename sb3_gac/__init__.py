@@ -21,6 +21,7 @@ if find_spec("gymnasium") is not None:
 if TYPE_CHECKING:
     from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
     from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
+    from sb3_gac.base.recording import write_recording
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
     from sb3_gac.baselines.cosil import COSIL
     from sb3_gac.baselines.gpo import GPOClip, GPOPenalty
@@ -56,6 +57,7 @@ _WHERE = {
     "SeededEvalCallback": "sb3_gac.base.callbacks",
     "export_learner": "sb3_gac.deploy.export",
     "preset": "sb3_gac.presets",
+    "write_recording": "sb3_gac.base.recording",
 }
 
 
@@ -102,4 +104,5 @@ __all__ = [
     "envs",
     "export_learner",
     "preset",
+    "write_recording",
 ]

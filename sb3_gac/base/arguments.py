@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
 from inspect import Parameter
+from os import PathLike
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, TypedDict, get_args, get_type_hints
 
@@ -57,6 +58,7 @@ class OffPolicyArguments(PositionalArguments, total=False):
     update_every: Annotated[Mapping[str, int] | None, None]
     behaviour: Annotated[BehaviourSpec, None]
     behaviour_per: Annotated[str, "episode"]
+    recording: Annotated[str | PathLike | None, None]
     lr_scales: Annotated[Mapping[str, float] | None, None]
     role_keys: Annotated[RoleKeys | None, None]
     compile: Annotated[bool, False]

@@ -4,6 +4,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Mapping
 from copy import deepcopy
+from os import PathLike
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,6 +22,7 @@ from sb3_gac.base.behaviour import Behaviour, BehaviourSpec
 from sb3_gac.base.collecting import DataCollection
 from sb3_gac.base.overrides import check_known, check_unchanged
 from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.base.recording import Recording
 from sb3_gac.base.roles import RoleKeys, resolve_update_every
 from sb3_gac.base.update import Batch, Metrics
 from sb3_gac.checks.arguments import COMMON_CHECKS, OFF_POLICY_CHECKS, ArgumentCheck, check_train_freq
@@ -70,6 +72,8 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
     :param behaviour: which policy collects the data, by name, or name -> share of episodes, a number or a schedule; by
         default that of the algorithm; a frozen teacher has the name of its argument
     :param behaviour_per: "episode", or "environment" for shares of the environments
+    :param recording: path of what :func:`sb3_gac.write_recording` wrote of another run: its actions are taken, warm-up
+        included, in environments that are made alike and return what they did, which is checked; ``None`` for own data
     :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
         "critic" stands for all critics: where ``privileged`` is the whole state, spare them the sensor noise with
@@ -92,6 +96,7 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
     fixed_arguments = (*AsymmetricAlgorithm.fixed_arguments, "buffer_size", "replay_buffer_class")
     progress = (*AsymmetricAlgorithm.progress, *DataCollection.collected)
     _waiting = False
+    _recorded: Recording | None = None
 
     def __init__(
         self,
@@ -113,6 +118,7 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         self.update_every: Mapping[str, int] | None = arguments.pop("update_every")
         self.behaviour: BehaviourSpec = arguments.pop("behaviour")
         self.behaviour_per: str = arguments.pop("behaviour_per")
+        self.recording: str | PathLike | None = arguments.pop("recording")
         self.lr_scales: Mapping[str, float] | None = arguments.pop("lr_scales")
         self.role_keys: RoleKeys | None = arguments.pop("role_keys")
         self.compile: bool = arguments.pop("compile")
@@ -157,6 +163,9 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
         check_goals(self.replay_buffer_class, self.observation_space, self.env)
         resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
+        buffer_class = self.replay_buffer_class or CompactDictReplayBuffer
+        if self.recording is not None and not issubclass(buffer_class, CompactDictReplayBuffer):
+            raise ValueError("recording needs a CompactDictReplayBuffer: leave replay_buffer_class out.")
         self._make_behaviour()
         if self.is_recurrent:
             check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
@@ -244,6 +253,9 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
     def _next_action(
         self, learning_starts: int, action_noise: ActionNoise | None, n_envs: int
     ) -> tuple[np.ndarray, np.ndarray]:
+        if self._recorded is not None:
+            scaled = self._recorded.actions(self.num_timesteps // n_envs).reshape(n_envs, *self.action_space.shape)  # type: ignore
+            return self._in_environments_range(scaled), scaled
         warms_up = self.num_timesteps < learning_starts
         episode_starts = np.ones(n_envs, dtype=bool) if self._last_episode_starts is None else self._last_episode_starts
         if len(self.acting) != n_envs:
@@ -284,7 +296,15 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         """
         return self.policy.unscale_action(action) if isinstance(self.action_space, spaces.Box) else action
 
+    def call_hooks(self, dones: np.ndarray) -> None:
+        """See :meth:`EpisodeHooks.call_hooks`; first, a recorded step must be what it was."""
+        if self._recorded is not None:
+            assert isinstance(self.replay_buffer, CompactDictReplayBuffer)
+            self._recorded.check(self.num_timesteps // self.n_envs - 1, self.replay_buffer.newest_rewards())
+        super().call_hooks(dones)
+
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        self._recorded = None if self.recording is None else Recording(self.recording, self.n_envs)
         result = super()._setup_learn(*args, **kwargs)
         assert self.env is not None
         check_rewards_of_goals(self.replay_buffer_class, self.replay_buffer_kwargs, self.env)
@@ -392,4 +412,4 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "chooses_behaviour"]
+        return [*super()._excluded_save_params(), "chooses_behaviour", "_recorded"]

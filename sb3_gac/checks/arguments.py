@@ -203,4 +203,5 @@ OFF_POLICY_CHECKS: Mapping[str, ArgumentCheck] = {
     "update_every": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
     "behaviour": partial(check_type, types=(str, Mapping, type(None)), expected="a policy's name, a dict of shares or None"),
     "behaviour_per": partial(check_choice, choices=("episode", "environment")),
+    "recording": partial(check_type, types=(str, os.PathLike, type(None)), expected="a path or None"),
 }

@@ -108,6 +108,10 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         """Transitions kept per environment."""
         return min(self._n_added, self.buffer_size)
 
+    def newest_rewards(self) -> np.ndarray:
+        """Of the step that was added last, shape (n_envs,)."""
+        return self.rewards[(self._n_added - 1) % self.n_rows]
+
     def reset(self) -> None:
         """Forget everything."""
         super().reset()

@@ -328,3 +328,20 @@ def test_what_is_needed_is_tried_out_first_and_what_needs_it_only_in_its_environ
     assert len(jobs_left(_suite(tmp_path, cell), tmp_path)[0]) == len(jobs)
     assert np.all([job.spec.environment == {"id": "sb3_gac/Pendulum-v1", "kwargs": {}, "wrappers": []} for job in jobs])
     assert Path(jobs[0].directory).parts[-3] == "sb3_gac-Pendulum-v1"
+
+
+def test_a_run_may_learn_from_what_another_one_has_recorded(tmp_path):
+    own = {"yoked": {"class": "asymmetric_sac", "needs": {"recording": {"algorithm": "gac"}}}}
+    suite = _suite(tmp_path, CELL | {"algorithms": ["yoked"]}, algorithms=own)
+    jobs, _ = jobs_left(suite, tmp_path / "runs")
+    assert [job.spec.algorithm for job in jobs] == ["gac", "yoked"]
+    for job in jobs:
+        run(job.spec, tmp_path / "runs")
+    recorded, taken = (np.load(job.directory / "recording.npz") for job in jobs)
+    for name in ("actions", "rewards"):
+        np.testing.assert_array_equal(recorded[name], taken[name])
+    assert len(recorded["actions"]) * jobs[0].spec.envs == jobs[0].spec.steps
+    (jobs[0].directory / "recording.npz").unlink()
+    (jobs[1].directory / "evaluations.csv").unlink()
+    with pytest.raises(ValueError, match=r"recording.npz is needed, and gone: remove .*gac/seed0, and run it again"):
+        jobs_left(suite, tmp_path / "runs")

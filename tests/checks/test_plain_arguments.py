@@ -141,7 +141,7 @@ def test_a_model_made_with_foreign_numbers_is_saved_loaded_and_resumed(cls, tmp_
 
 def test_every_argument_that_can_hold_a_number_is_tried():
     others = {"policy", "env", "action_noise", "replay_buffer_class", "role_keys", "kl_coef", "kl_reduction", "guider"}
-    others |= {"shared_std", "tensorboard_log", "device", "_init_setup_model", "behaviour_per"}
+    others |= {"shared_std", "tensorboard_log", "device", "_init_setup_model", "behaviour_per", "recording"}
     assert set(inspect.signature(GAC).parameters) == {*SHARED, *GACS_OWN, *others}
 
 
