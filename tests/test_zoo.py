@@ -128,7 +128,8 @@ def test_the_zoos_own_algorithms_train(tmp_path):
 def test_every_algorithm_has_hyperparameters_that_it_takes_for_every_registered_task(algorithm):
     settings = hyperparameters(algorithm)
     assert {"default", "sb3_gac/Pendulum-v1"} == set(settings) - {f"sb3_gac/{task}-v5" for task in envs.suites.mujoco.TASKS}
-    assert settings[ENV]["role_keys"] == {"critic": ["privileged"]}
+    of_critics = None if algorithm == "rma" else {"critic": ["privileged"]}  # whose critics see its encoder's latent
+    assert settings[ENV]["role_keys"] == of_critics
     assert "role_keys" not in settings["default"], "elsewhere the privileged entry may not be the whole state"
     shared = {"n_envs": 4, "n_timesteps": 100_000, "policy": "MultiInputPolicy", "batch_size": 128, "gradient_steps": -1}
     assert shared.items() <= settings["default"].items()
