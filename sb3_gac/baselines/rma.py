@@ -17,7 +17,7 @@ from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles
 from sb3_gac.base.update import Batch, Loss, Metrics
-from sb3_gac.checks.arguments import unless
+from sb3_gac.checks.arguments import ArgumentCheck, unless
 from sb3_gac.checks.values import check_integer
 from sb3_gac.math.losses import masked_mean, policy_loss
 from sb3_gac.networks.actors import Actor
@@ -107,7 +107,7 @@ class RMA(AsymmetricOffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": RMAPolicy}
-    argument_checks: ClassVar[Mapping[str, Any]] = {
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {
         "history": partial(check_integer, low=1),
         "phase_1_steps": unless(None, check_integer, low=1, remedy="or None for half of the steps"),
     }
@@ -167,11 +167,11 @@ class RMA(AsymmetricOffPolicyAlgorithm):
         """Phase 1: SAC's, with z in place of what is privileged. Phase 2: the estimate of z."""
         if self.phase == 2:
             return self.minimize("adaptation", self.adaptation_loss, batch)
-        beta = self.coefficients["ent_coef"].value
+        ent_coef, beta = self.ent_coef_dual, self.ent_coef_dual.value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
         metrics = self.minimize(("critic", "expert"), self.critic_loss, batch, noise[0], beta)
         metrics |= self.minimize(("actor", "expert"), self.actor_loss, batch, noise[1], beta)
-        metrics |= self.coefficients["ent_coef"].update(float(self.target_entropy) - metrics["entropy"])
+        metrics |= ent_coef.update(float(self.target_entropy) - metrics["entropy"])
         return metrics | self.coefficient_values()
 
     def critic_loss(self, batch: Batch, noise: th.Tensor, beta: th.Tensor) -> Loss:
@@ -185,8 +185,8 @@ class RMA(AsymmetricOffPolicyAlgorithm):
         """Climb the critics, with entropy, by the actor's layers and the encoder; what the critics see is a constant."""
         now: Any = self.policy.expert.distribution(batch.observations)
         q, log_prob = now.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
-        loss = policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask)
-        return Loss(loss, {"entropy": -masked_mean(log_prob, batch.mask)})
+        entropy = -masked_mean(log_prob, batch.mask)
+        return Loss(policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask), {"entropy": entropy})
 
     def adaptation_loss(self, batch: Batch) -> Loss:
         """Mean squared error of the estimates of z that the actor had."""

@@ -36,7 +36,7 @@ def _assert_equal(model, other, **tolerance):
         th.testing.assert_close(coefficient.value, other.coefficients[name].value, **tolerance)
 
 
-@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL, COSIL, RMA])
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL, COSIL])
 def test_compiled_training_is_plain_training(cls, tmp_path):
     """Through other batch sizes and settings, new weights, a copy of the policy and a save: nothing stale is used."""
     plain, compiled = _filled(cls), _filled(cls, compile=True)
