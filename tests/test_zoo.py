@@ -12,9 +12,10 @@ pytest.importorskip("rl_zoo3")
 
 from sb3_gac import envs
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
-from sb3_gac.zoo import convert, hyperparameters, sample, with_hyperparameters
+from sb3_gac.zoo import convert, hyperparameters, main, sample, with_hyperparameters
 
 TRAINED = ("gac", "asymmetric_sac")
+TAUGHT = sorted(name for name in ALGORITHMS if "teacher" in algorithm_class(name).frozen_arguments)
 ENV = "sb3_gac/InvertedDoublePendulum-v5"
 QUICK = ["learning_starts:20", "batch_size:8", "policy_kwargs:dict(net_arch=[8])", "n_envs:1", "gradient_steps:1"]
 
@@ -51,6 +52,22 @@ def test_train_saves_what_the_zoo_saves(trained, algorithm):
 def test_enjoy_runs_the_deployed_policy(trained, algorithm):
     output = _zoo("enjoy", trained, "--algo", algorithm, "--folder", "logs", "-n", 50, "--no-render")
     assert "Mean reward" in output
+
+
+@pytest.mark.parametrize("algorithm", TAUGHT)
+def test_a_student_trains_with_a_teachers_file_and_acts(algorithm, tmp_path, monkeypatch, capsys):
+    env = envs.make_mujoco("InvertedDoublePendulum", noise_std=0.2)
+    algorithm_class("asymmetric_sac")("MultiInputPolicy", env, buffer_size=10).save(tmp_path / "teacher.zip")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["zoo"])
+    given = ["--algo", algorithm, "--env", ENV]
+    own = ["-n", "60", "--env-kwargs", "noise_std:0.2", "--eval-freq", "-1", "-params", *QUICK, "teacher:'teacher.zip'"]
+    main(["train", *given, *own])
+    main(["enjoy", *given, "--folder", "logs", "-n", "20", "--no-render"])
+    assert "Mean reward" in capsys.readouterr().out
+    trials = ["-optimize", "--n-trials", "1", "--n-jobs", "1", "--n-evaluations", "1", "--eval-episodes", "1"]
+    main(["train", *given, "-n", "30", *trials, "--no-optim-plots", "-params", *QUICK, "teacher:'teacher.zip'"])
+    assert "Best trial" in capsys.readouterr().out
 
 
 def test_record_video_writes_one(trained):
