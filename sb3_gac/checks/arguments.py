@@ -122,6 +122,25 @@ def unless(other: Any, check: ArgumentCheck, **options: Any) -> ArgumentCheck:
     return checked
 
 
+class Unused:
+    """
+    Refuses a shared argument that an algorithm has no use for, rather than ignoring what was given.
+
+    :param reason: why it has none, as a clause
+    :param default: the one value that says nothing
+    """
+
+    def __init__(self, reason: str, default: Any = "auto"):
+        self.reason, self.default = reason, default
+
+    def __call__(self, name: str, value: Any) -> None:
+        """
+        :raises ValueError: unless it was left out
+        """
+        if value != self.default:
+            raise ValueError(f"{name} changes nothing here, for {self.reason}: leave it out, got {value!r}.")
+
+
 def check_switch(name: str, value: Any) -> None:
     """
     :raises ValueError: unless it is true or false
