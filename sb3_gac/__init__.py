@@ -21,6 +21,7 @@ if find_spec("gymnasium") is not None:
 if TYPE_CHECKING:
     from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
     from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
+    from sb3_gac.baselines.asymmetric_mpo import AsymmetricMPO
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
     from sb3_gac.baselines.tgrl import TGRL
     from sb3_gac.checkpoint.files import CheckpointError
@@ -76,6 +77,7 @@ __all__ = [
     "GAC",
     "PRESETS",
     "TGRL",
+    "AsymmetricMPO",
     "AsymmetricSAC",
     "CheckpointError",
     "CompactDictReplayBuffer",

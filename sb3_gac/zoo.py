@@ -22,6 +22,7 @@ from typing import Any
 import yaml
 
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class, name_of
+from sb3_gac.checks.arguments import Unused, merged
 from sb3_gac.envs.suites import SUITES
 from sb3_gac.presets import merge, read_preset
 
@@ -62,7 +63,10 @@ def sample(name: str, trial: optuna.Trial, n_actions: int, n_envs: int, addition
     :param n_envs: unused
     :param additional_args: unused
     """
-    families = {"all", *map(name_of, algorithm_class(name).__mro__)}
+    kind = algorithm_class(name)
+    families = {"all", *map(name_of, kind.__mro__)}
+    if not isinstance(merged(kind, "argument_checks").get("target_entropy"), Unused):
+        families.add("entropy")
     suggested = [suggest(trial) for family, suggest in SUGGESTIONS.items() if family in families]
     return convert({argument: value for arguments in suggested for argument, value in arguments.items()})
 
@@ -73,9 +77,13 @@ def _suggest_shared(trial: optuna.Trial) -> dict[str, Any]:
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
         "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 9),
         "tau": trial.suggest_float("tau", 1e-3, 0.05, log=True),
-        "target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"]),
         "net_arch": trial.suggest_categorical("net_arch", list(_NET_ARCHS)),
     }
+
+
+def _suggest_entropy(trial: optuna.Trial) -> dict[str, Any]:
+    """How much of it there is to be."""
+    return {"target_entropy": trial.suggest_categorical("target_entropy", ["auto", "sac"])}
 
 
 def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
@@ -87,8 +95,22 @@ def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
     }
 
 
-#: "all", or an algorithm, with its subclasses -> what it has to sample
-SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {"all": _suggest_shared, "gac": _suggest_guidance}
+def _suggest_bounds(trial: optuna.Trial) -> dict[str, Any]:
+    """How far a step of the policy may go."""
+    return {
+        "target_improvement": trial.suggest_float("target_improvement", 0.01, 1.0, log=True),
+        "target_kl": trial.suggest_float("target_kl", 1e-3, 0.1, log=True),
+        "target_std_kl": trial.suggest_float("target_std_kl", 1e-6, 1e-3, log=True),
+    }
+
+
+#: "all", "entropy" for those that have a use for it, or an algorithm, with its subclasses -> what it has to sample
+SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {
+    "all": _suggest_shared,
+    "entropy": _suggest_entropy,
+    "gac": _suggest_guidance,
+    "asymmetric_mpo": _suggest_bounds,
+}
 
 
 def convert(sampled_params: dict[str, Any]) -> dict[str, Any]:

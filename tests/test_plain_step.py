@@ -13,9 +13,11 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import GAC, TGRL, AsymmetricMPO, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac.checks.arguments import Unused, merged
 from tests.helpers import gradient_step, noise_of_step, unlike_each_other
-from tests.plain.algorithm_1 import PlainGAC, PlainGACWithoutQ, PlainSAC, PlainTGRL, Settings
+from tests.plain.algorithm_1 import PlainGAC, PlainGACWithoutQ, PlainSAC, PlainTGRL
+from tests.plain.mpo import PlainMPO
 from tests.plain.replay import PlainReplay, Recorded
 
 BOUNDS = (-1.2, 0.4)
@@ -23,7 +25,14 @@ SIZES = {"net_arch": [8, 6], "log_std_bounds": BOUNDS}
 MEMORY = {"net_arch": [6], "rnn_hidden_size": 5, "rnn_net_arch": [6]}
 SHARED = {"learning_rate": 0.01, "gamma": 0.9, "tau": 0.1, "ent_coef": "auto_0.3", "target_entropy": -0.7}
 GUIDED = {"target_kl": 0.2, "kl_coef": "auto_2.0", "kl_coef_bounds": (0.5, 8.0), "kl_coef_learning_rate": 0.05}
-PLAIN = {GAC: PlainGAC, GACShare: PlainGAC, GACWithoutQ: PlainGACWithoutQ, AsymmetricSAC: PlainSAC, TGRL: PlainTGRL}
+PLAIN = {
+    GAC: PlainGAC,
+    GACShare: PlainGAC,
+    GACWithoutQ: PlainGACWithoutQ,
+    AsymmetricSAC: PlainSAC,
+    TGRL: PlainTGRL,
+    AsymmetricMPO: PlainMPO,
+}
 
 
 @dataclass
@@ -50,6 +59,16 @@ SUM = {"kl_reduction": "sum", "target_kl": 0.4}
 CLIPPED = {"max_grad_norm": 0.5}
 N_STEPS = {"n_steps": 3}
 PARTS = {"replay_buffer_kwargs": {"sequence_length": 2, "burn_in": 2}}
+MPO = {
+    "n_actions": 3,
+    "temperature": "auto_1.5",
+    "target_improvement": 0.3,
+    "kl_coef": "auto_2.0",
+    "target_kl": 0.2,
+    "std_kl_coef": "auto_3.0",
+    "target_std_kl": 0.1,
+    "dual_learning_rate": 0.05,
+}
 OTHERS = {
     "kl_coef": 0.7,
     "ent_coef": 0.2,
@@ -120,12 +139,24 @@ CASES = {
         TGRL, of_model={"policy_kwargs": {"rnn_type": dict.fromkeys(("actor", "auxiliary"), "gru")}}, cell="Gru"
     ),
     "LSTM, SAC, normalised": Case(AsymmetricSAC, cell="Lstm", normalised=True),
+    "MPO": Case(AsymmetricMPO, MPO),
+    "MPO, clipped, n steps": Case(AsymmetricMPO, MPO | CLIPPED, of_model=N_STEPS),
+    "MPO, fixed coefficients": Case(AsymmetricMPO, MPO | {"temperature": 0.5, "kl_coef": 0.0, "std_kl_coef": 0.7}),
+    "MPO, discrete": Case(AsymmetricMPO, MPO, discrete=True),
+    "MPO, GRU": Case(AsymmetricMPO, MPO, cell="Gru"),
+    "MPO, GRU, discrete": Case(AsymmetricMPO, MPO, cell="Gru", discrete=True),
+    "MPO, GRU, parts of episodes": Case(AsymmetricMPO, MPO, of_model=PARTS, cell="Gru", normalised=True),
+    "MPO, GRU for the actor alone": Case(
+        AsymmetricMPO, MPO, of_model={"policy_kwargs": {"rnn_type": {"actor": "gru"}}}, cell="Gru"
+    ),
 }
 
 
 def _settings(case):
-    arguments = SHARED | (GUIDED if issubclass(case.cls, GAC) else {}) | case.arguments
-    return Settings(**{"log_std_bounds": BOUNDS, **arguments, **case.resolved}), arguments
+    refused = {name for name, check in merged(case.cls, "argument_checks").items() if isinstance(check, Unused)}
+    shared = {name: value for name, value in SHARED.items() if name not in refused}
+    arguments = shared | (GUIDED if issubclass(case.cls, GAC) else {}) | case.arguments
+    return PLAIN[case.cls].settings_class(**{"log_std_bounds": BOUNDS, **arguments, **case.resolved}), arguments
 
 
 def _model(case, settings, arguments):
@@ -186,9 +217,9 @@ def test_a_gradient_step_is_the_plain_one(name):
     for key, start in before.items():
         moved = (th.cat([p.detach().flatten() for p in plain.networks[key].parameters()]) - start).abs().max()
         assert moved > 1e-3, f"{key} stood still: nothing was tested"
-    assert model.ent_coef_tensor.item() == pytest.approx(plain.beta.value.item(), rel=1e-5)
-    if issubclass(case.cls, GAC):
-        assert model.kl_coef_dual.value.item() == pytest.approx(plain.alpha.value.item(), rel=1e-5)
+    assert set(plain.coefficients) == {name for name in model.coefficients if name != "teacher_coef"}
+    for key, coefficient in plain.coefficients.items():
+        np.testing.assert_allclose(model.coefficients[key].value, coefficient.value, rtol=1e-5, err_msg=key)
 
 
 def _assert_same(name, ours, theirs):

@@ -147,8 +147,10 @@ def test_every_argument_that_is_sampled_is_used():
         suggest_categorical = staticmethod(lambda name, choices: choices[0])
 
     shared = {"gamma", "learning_rate", "batch_size", "tau", "target_entropy", "policy_kwargs"}
-    of_gac, of_share, of_sac = (sample(name, Trial(), 1, 1, {}) for name in ("gac", "gac_share", "asymmetric_sac"))
+    names = ("gac", "gac_share", "asymmetric_sac", "asymmetric_mpo")
+    of_gac, of_share, of_sac, of_mpo = (sample(name, Trial(), 1, 1, {}) for name in names)
     assert set(of_sac) == shared
+    assert set(of_mpo) == shared - {"target_entropy"} | {"target_improvement", "target_kl", "target_std_kl"}
     assert set(of_gac) == shared | {"target_kl", "kl_coef_learning_rate"}
     assert set(of_share) == set(of_gac), "as a subclass of GAC"
     assert (of_gac["gamma"], of_gac["batch_size"], of_gac["target_kl"]) == (0.999, 64, 3e-4)

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC
+from sb3_gac import GAC, TGRL, AsymmetricMPO, AsymmetricSAC
 from sb3_gac.optim.compile import Program
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
 
@@ -32,7 +32,7 @@ def _assert_equal(model, other, **tolerance):
         th.testing.assert_close(p, q, **tolerance, msg=lambda text, name=name: f"{name}: {text}")
 
 
-@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL])
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL, AsymmetricMPO])
 def test_compiled_training_is_plain_training(cls, tmp_path):
     """Through other batch sizes and settings, new weights, a copy of the policy and a save: nothing stale is used."""
     plain, compiled = _filled(cls), _filled(cls, compile=True)
@@ -75,6 +75,7 @@ KINDS = {
         role_keys={"critic": ["privileged"]},
         **arguments,
     ),
+    "MPO, discrete": lambda **arguments: _filled(AsymmetricMPO, env=TwoViewChoice(), **arguments),
     "guider's std, pulled": lambda **arguments: _filled(GAC, shared_std="guider", learner_kl_scale=1.0, **arguments),
 }
 
