@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
     from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
     from sb3_gac.base.recording import write_recording
+    from sb3_gac.baselines.asymmetric_mpo import AsymmetricMPO
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
     from sb3_gac.baselines.cosil import COSIL
     from sb3_gac.baselines.gpo import GPOClip, GPOPenalty
@@ -83,6 +84,7 @@ __all__ = [
     "PRESETS",
     "RMA",
     "TGRL",
+    "AsymmetricMPO",
     "AsymmetricSAC",
     "CheckpointError",
     "CompactDictReplayBuffer",

@@ -8,6 +8,7 @@ ALGORITHMS = {
     "gac": "sb3_gac.gac.gac:GAC",
     "gac_share": "sb3_gac.gac.ablations:GACShare",
     "gac_without_q": "sb3_gac.gac.ablations:GACWithoutQ",
+    "asymmetric_mpo": "sb3_gac.baselines.asymmetric_mpo:AsymmetricMPO",
     "asymmetric_sac": "sb3_gac.baselines.asymmetric_sac:AsymmetricSAC",
     "cosil": "sb3_gac.baselines.cosil:COSIL",
     "rma": "sb3_gac.baselines.rma:RMA",

@@ -62,7 +62,8 @@ def sample(name: str, trial: optuna.Trial, n_actions: int, n_envs: int, addition
     :param n_envs: unused
     :param additional_args: unused
     """
-    families = {"all", *map(name_of, algorithm_class(name).__mro__)}
+    kind = algorithm_class(name)
+    families = {"all", *map(name_of, kind.__mro__)}
     suggested = [suggest(trial) for family, suggest in SUGGESTIONS.items() if family in families]
     return convert({argument: value for arguments in suggested for argument, value in arguments.items()})
 
@@ -122,12 +123,22 @@ def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
     }
 
 
+def _suggest_bounds(trial: optuna.Trial) -> dict[str, Any]:
+    """How far a step of the policy may go."""
+    return {
+        "target_improvement": trial.suggest_float("target_improvement", 0.01, 1.0, log=True),
+        "target_kl": trial.suggest_float("target_kl", 1e-3, 0.1, log=True),
+        "target_std_kl": trial.suggest_float("target_std_kl", 1e-6, 1e-3, log=True),
+    }
+
+
 #: "all", or a family or an algorithm, with its subclasses -> what it has to sample
 SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {
     "all": _suggest_shared,
     "off_policy": _suggest_off_policy,
     "on_policy": _suggest_on_policy,
     "gac": _suggest_guidance,
+    "asymmetric_mpo": _suggest_bounds,
     "asymmetric_sac": _suggest_entropy,
     "cosil": _suggest_distance,
     "tgrl": _suggest_entropy,

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricSAC, GPOClip, GPOPenalty, OnnxPolicy, export_learner
+from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricMPO, AsymmetricSAC, GPOClip, GPOPenalty, OnnxPolicy, export_learner
 from sb3_gac.envs import History
 from tests.helpers import Sampled, small_model
 
@@ -31,10 +31,10 @@ READS_TWO = {"role_keys": {"learner": ["partial", "proprio"]}}
 READS_ALL = {"role_keys": {"learner": ["partial", "privileged"]}}
 
 
-def _recurrent(cell, env, policy_kwargs=None, **arguments):
+def _recurrent(cell, env, policy_kwargs=None, cls=GAC, **arguments):
     options = {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8], **(policy_kwargs or {})}
     arguments |= {"learning_starts": 20, "batch_size": 4, "seed": 0, "device": "cpu"}
-    return GAC(f"MultiInput{cell}Policy", env, policy_kwargs=options, **arguments)
+    return cls(f"MultiInput{cell}Policy", env, policy_kwargs=options, **arguments)
 
 
 def _on_policy(env, policy_kwargs=None, cls=GPOClip):
@@ -72,6 +72,8 @@ KINDS = {
     "RMA": lambda: small_model(Sampled(VECTORS), cls=RMA, history=3),
     "RMA, discrete, normalised": lambda: small_model(_normalised(CHOICE), cls=RMA, history=12),
     "RMA, cnn": lambda: small_model(Sampled(IMAGES), cls=RMA, history=2, policy_kwargs=CNN, batch_size=4),
+    "asymmetric MPO": lambda: small_model(Sampled(VECTORS), cls=AsymmetricMPO, n_actions=4),
+    "asymmetric MPO, gru": lambda: _recurrent("Gru", Sampled(VECTORS), cls=AsymmetricMPO),
 }
 
 

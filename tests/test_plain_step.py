@@ -13,10 +13,11 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import COSIL, GAC, TGRL, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import COSIL, GAC, TGRL, AsymmetricMPO, AsymmetricSAC, GACShare, GACWithoutQ
 from tests.helpers import gradient_step, noise_of_step, unlike_each_other
-from tests.plain.algorithm_1 import Coefficient, PlainGAC, PlainGACWithoutQ, PlainSAC, PlainTGRL, Settings
+from tests.plain.algorithm_1 import PlainGAC, PlainGACWithoutQ, PlainSAC, PlainTGRL
 from tests.plain.cosil import PlainCOSIL
+from tests.plain.mpo import PlainMPO
 from tests.plain.replay import PlainReplay, Recorded
 
 BOUNDS = (-1.2, 0.4)
@@ -32,9 +33,9 @@ NEAR = {
 }
 GUIDED = {"target_kl": 0.2, "kl_coef": "auto_2.0", "kl_coef_bounds": (0.5, 8.0), "kl_coef_learning_rate": 0.05}
 PLAIN = {GAC: PlainGAC, GACShare: PlainGAC, GACWithoutQ: PlainGACWithoutQ, AsymmetricSAC: PlainSAC, TGRL: PlainTGRL}
-PLAIN |= {COSIL: PlainCOSIL}
+PLAIN |= {COSIL: PlainCOSIL, AsymmetricMPO: PlainMPO}
 #: Algorithm, with its subclasses -> arguments of all its cases
-OF_ALL = {GAC: ENTROPY | GUIDED, AsymmetricSAC: ENTROPY, TGRL: ENTROPY, COSIL: NEAR}
+OF_ALL = {GAC: ENTROPY | GUIDED, AsymmetricSAC: ENTROPY, TGRL: ENTROPY, COSIL: NEAR, AsymmetricMPO: {}}
 
 
 @dataclass
@@ -62,6 +63,16 @@ CLIPPED = {"max_grad_norm": 0.5}
 N_STEPS = {"n_steps": 3}
 PARTS = {"replay_buffer_kwargs": {"sequence_length": 2, "burn_in": 2}}
 PAIRS, FOUR = {"critic_groups": 2}, {"policy_kwargs": {"n_critics": 4}}
+MPO = {
+    "n_actions": 3,
+    "temperature": "auto_1.5",
+    "target_improvement": 0.3,
+    "kl_coef": "auto_2.0",
+    "target_kl": 0.2,
+    "std_kl_coef": "auto_3.0",
+    "target_std_kl": 0.1,
+    "dual_learning_rate": 0.05,
+}
 OTHERS = {
     "kl_coef": 0.7,
     "ent_coef": 0.2,
@@ -143,13 +154,23 @@ CASES = {
     "COSIL, GRU": Case(COSIL, cell="Gru"),
     "COSIL, GRU, parts of episodes, discrete": Case(COSIL, of_model=PARTS, cell="Gru", discrete=True),
     "COSIL, LSTM, normalised": Case(COSIL, cell="Lstm", normalised=True),
+    "MPO": Case(AsymmetricMPO, MPO),
+    "MPO, clipped, n steps": Case(AsymmetricMPO, MPO | CLIPPED, of_model=N_STEPS),
+    "MPO, fixed coefficients": Case(AsymmetricMPO, MPO | {"temperature": 0.5, "kl_coef": 0.0, "std_kl_coef": 0.7}),
+    "MPO, discrete": Case(AsymmetricMPO, MPO, discrete=True),
+    "MPO, GRU": Case(AsymmetricMPO, MPO, cell="Gru"),
+    "MPO, GRU, discrete": Case(AsymmetricMPO, MPO, cell="Gru", discrete=True),
+    "MPO, GRU, parts of episodes": Case(AsymmetricMPO, MPO, of_model=PARTS, cell="Gru", normalised=True),
+    "MPO, GRU for the actor alone": Case(
+        AsymmetricMPO, MPO, of_model={"policy_kwargs": {"rnn_type": {"actor": "gru"}}}, cell="Gru"
+    ),
 }
 
 
 def _settings(case):
     (of_all,) = (arguments for cls, arguments in OF_ALL.items() if issubclass(case.cls, cls))
     arguments = SHARED | of_all | case.arguments
-    return Settings(**{"log_std_bounds": BOUNDS, **arguments, **case.resolved}), arguments
+    return PLAIN[case.cls].settings_class(**{"log_std_bounds": BOUNDS, **arguments, **case.resolved}), arguments
 
 
 def _model(case, settings, arguments):
@@ -210,12 +231,10 @@ def test_a_gradient_step_is_the_plain_one(name):
     for key, start in before.items():
         moved = (th.cat([p.detach().flatten() for p in plain.networks[key].parameters()]) - start).abs().max()
         assert moved > 1e-3, f"{key} stood still: nothing was tested"
-    learned = {
-        one.name: one for one in vars(plain).values() if isinstance(one, Coefficient) and one.name in model.coefficients
-    }
-    assert set(model.coefficients) - set(learned) <= {"teacher_coef"}, "which TGRL moves by steps"
-    for coefficient, one in learned.items():
-        assert model.coefficients[coefficient].value.item() == pytest.approx(one.value.item(), rel=1e-5)
+    by_steps = {"teacher_coef"} if case.cls is TGRL else set()
+    assert set(plain.coefficients) == set(model.coefficients) - by_steps
+    for key, coefficient in plain.coefficients.items():
+        np.testing.assert_allclose(model.coefficients[key].value, coefficient.value, rtol=1e-5, err_msg=key)
 
 
 def _assert_same(name, ours, theirs):

@@ -169,11 +169,12 @@ def test_every_argument_that_is_sampled_is_used():
         suggest_categorical = staticmethod(lambda name, choices: choices[0])
 
     shared = {"gamma", "learning_rate", "batch_size", "tau", "policy_kwargs"}
-    names = ("gac", "gac_share", "asymmetric_sac", "tgrl", "cosil")
-    of_gac, of_share, of_sac, of_tgrl, of_cosil = (sample(name, Trial(), 1, 1, {}) for name in names)
+    names = ("gac", "gac_share", "asymmetric_sac", "tgrl", "cosil", "asymmetric_mpo")
+    of_gac, of_share, of_sac, of_tgrl, of_cosil, of_mpo = (sample(name, Trial(), 1, 1, {}) for name in names)
     assert set(of_sac) == set(of_tgrl) == shared | {"target_entropy"}
     assert set(of_cosil) == shared | {"target_divergence", "teacher_coef_learning_rate"}
     assert set(of_gac) == set(of_sac) | {"target_kl", "kl_coef_learning_rate"}
+    assert set(of_mpo) == shared | {"target_improvement", "target_kl", "target_std_kl"}
     assert set(of_share) == set(of_gac), "as a subclass of GAC"
     assert (of_gac["gamma"], of_gac["batch_size"], of_gac["target_kl"]) == (0.999, 64, 3e-4)
     of_clip, of_penalty = (set(sample(name, Trial(), 1, 1, {})) for name in ("gpo_clip", "gpo_penalty"))

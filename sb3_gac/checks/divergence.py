@@ -69,7 +69,7 @@ def diagnose(
         "n_updates": model._n_updates,
         "metrics": metrics,
         "last_good_metrics": dict(last_good),
-        "coefficients": {name: value.item() for name, value in coefficients.items()},
+        "coefficients": {name: value.tolist() for name, value in coefficients.items()},
         "largest_in_a_batch": {name: values.float().abs().max().item() for name, values in entries.items()},
         "arguments": _arguments(model),
     }

@@ -2,7 +2,8 @@
 Action distributions: tanh-squashed diagonal Gaussians, of which guider and learner share a std, and categorical ones.
 
 Both answer the same questions, so that one update serves both: the expected value and log-probability of their actions
-(by one sample, or exactly), KL divergence, a correction on top of another, and what one borrows of another.
+(by one sample, or exactly), several actions to choose among, KL divergence, a correction on top of another, and what one
+borrows of another.
 """
 
 import math
@@ -16,6 +17,36 @@ KL_REDUCTIONS = ("mean", "sum")
 #: Actions, or None for all of them -> values, see the critic ensembles
 QFunction: TypeAlias = Callable[[Any], th.Tensor]
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+class Candidates(NamedTuple):
+    """
+    K actions of each state, which stand for all that a policy may do there: samples, or every action there is.
+
+    :param values: of each the smallest critic's, shape (\\*E, K)
+    :param log_shares: log of what each counts in an expectation, shape (\\*E, K), or () where all count alike
+    :param pre_tanh: samples before tanh, shape (K, \\*E, A); ``None`` for every action
+    """
+
+    values: th.Tensor
+    log_shares: th.Tensor
+    pre_tanh: th.Tensor | None = None
+
+    @property
+    def mean_value(self) -> th.Tensor:
+        """Expected value of the policy's action, as of an ensemble of one, shape (1, \\*E)."""
+        return (self.log_shares.exp() * self.values).sum(dim=-1)[None]
+
+    def improved(self, temperature: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        A better policy on the same actions, with shares in proportion to share exp(value / temperature).
+
+        :param temperature: how much better a value must be to count e times as much, scalar
+        :return: shares, shape (\\*E, K), and KL(better policy || policy), shape (\\*E)
+        """
+        log_weights = (self.log_shares + self.values / temperature).log_softmax(dim=-1)
+        weights = log_weights.exp()
+        return weights, (weights * (log_weights - self.log_shares)).sum(dim=-1)
 
 
 class TanhGaussian(NamedTuple):
@@ -80,6 +111,27 @@ class TanhGaussian(NamedTuple):
         action, log_prob = self.sample_with_log_prob(noise)
         return q_function(action), log_prob
 
+    def candidates(self, q_function: QFunction, noise: th.Tensor) -> Candidates:
+        """
+        :param q_function: actions, shape (K, \\*E, A) -> values of N critics, shape (N, K, \\*E)
+        :param noise: standard normal, shape (K, \\*E, A)
+        :return: K samples of each state
+        """
+        pre_tanh = self._pre_tanh(noise)
+        values = q_function(th.tanh(pre_tanh)).amin(dim=0).movedim(0, -1)
+        return Candidates(values, values.new_full((), -math.log(len(noise))), pre_tanh)
+
+    def log_likelihood(self, candidates: Candidates) -> th.Tensor:
+        """
+        Log-density of samples before tanh. That of the actions differs by log(1 - tanh(x)^2), which no policy changes.
+
+        :param candidates: samples of any policy
+        :return: shape (\\*E, K)
+        """
+        assert candidates.pre_tanh is not None
+        standardised = (candidates.pre_tanh - self.mean) * th.exp(-self.log_std)
+        return (-0.5 * standardised.square() - self.log_std - _LOG_SQRT_2PI).sum(dim=-1).movedim(0, -1)
+
     def kl(self, other: "TanhGaussian", reduction: str = "sum") -> th.Tensor:
         """
         KL(self || other), shape (\\*E): of any two, whatever their stds; tanh is a bijection, so it is also the KL after it.
@@ -87,10 +139,20 @@ class TanhGaussian(NamedTuple):
         :param other: shapes (\\*E, A)
         :param reduction: over action dimensions, "sum" (the definition) or "mean"
         """
+        return _reduced(self.kl_by_dimension(other), reduction)
+
+    def kl_by_dimension(self, other: "TanhGaussian") -> th.Tensor:
+        """KL(self || other) of each action dimension, shape (\\*E, A)."""
         log_ratio = other.log_std - self.log_std
         distance = (self.mean - other.mean) * th.exp(-other.log_std)
-        per_dimension = log_ratio + 0.5 * (th.exp(-2 * log_ratio) + distance.square() - 1)
-        return _reduced(per_dimension, reduction)
+        return log_ratio + 0.5 * (th.expm1(-2 * log_ratio) + distance.square())  # which does not cancel for like stds
+
+    def decoupled(self, anchor: "TanhGaussian") -> tuple["TanhGaussian", ...]:
+        """
+        :param anchor: another one, as a constant
+        :return: this mean with the anchor's std, and the anchor's mean with this std: what moves one moves the other not
+        """
+        return TanhGaussian(self.mean, anchor.log_std), TanhGaussian(anchor.mean, self.log_std)
 
     def kl_of_means(self, other: "TanhGaussian", reduction: str = "mean") -> th.Tensor:
         """
@@ -203,10 +265,30 @@ class Categorical(NamedTuple):
         probs = log_probs.exp()
         return (probs * q_function(None).amin(dim=0)).sum(dim=-1)[None], (probs * log_probs).sum(dim=-1)
 
+    def candidates(self, q_function: QFunction, noise: th.Tensor) -> Candidates:
+        """
+        :param q_function: None -> values of N critics, shape (N, \\*E, A)
+        :param noise: not needed
+        :return: all A actions, which count by their probabilities
+        """
+        return Candidates(q_function(None).amin(dim=0), self.logits.log_softmax(dim=-1))
+
+    def log_likelihood(self, candidates: Candidates) -> th.Tensor:
+        """Log-probabilities of all actions, shape (\\*E, A)."""
+        return self.logits.log_softmax(dim=-1)
+
     def kl(self, other: "Categorical", reduction: str = "sum") -> th.Tensor:
         """KL(self || other), shape (\\*E); there are no dimensions to reduce over."""
         log_probs = self.logits.log_softmax(dim=-1)
         return (log_probs.exp() * (log_probs - other.logits.log_softmax(dim=-1))).sum(dim=-1)
+
+    def kl_by_dimension(self, other: "Categorical") -> th.Tensor:
+        """KL(self || other) of the one dimension that there is, shape (\\*E, 1)."""
+        return self.kl(other)[..., None]
+
+    def decoupled(self, anchor: "Categorical") -> tuple["Categorical", ...]:
+        """Itself alone: there are no parts."""
+        return (self,)
 
     def kl_of_means(self, other: "Categorical", reduction: str = "sum") -> th.Tensor:
         """KL(self || other), shape (\\*E): there is no std to share."""

@@ -73,8 +73,8 @@ class CriticEnsemble(RoleModel):
     def forward(self, obs: PyTorchObs, actions: th.Tensor | None) -> th.Tensor:
         r"""
         :param obs: observation with at least the entries of this role, (\*E, ...) of each
-        :param actions: in [-1, 1], shape (\*E, A)
-        :return: shape (N, \*E)
+        :param actions: in [-1, 1], shape (\*E, A), or (K, \*E, A) for K of each observation
+        :return: shape (N, \*E), or (N, K, \*E)
         """
         return self.values(self.encode(obs), actions)
 
@@ -97,19 +97,24 @@ class CriticEnsemble(RoleModel):
         members = features if self.memory is not None else features.expand(self.n_critics, *features.shape)
         if members.dim() == 3:
             return self._values(members, actions)
-        flat_actions = None if actions is None else actions.flatten(0, 1)
-        return self._values(members.flatten(1, 2), flat_actions).unflatten(1, members.shape[1:3])
+        flat_actions = None if actions is None else actions.flatten(-3, -2)
+        several = actions is not None and actions.dim() == members.dim()
+        return self._values(members.flatten(1, 2), flat_actions).unflatten(2 if several else 1, members.shape[1:3])
 
     def _values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
         """
         :param features: shape (N, B, F)
-        :param actions: shape (B, A)
-        :return: shape (N, B)
+        :param actions: shape (B, A), or (K, B, A)
+        :return: shape (N, B), or (N, K, B)
         """
         assert actions is not None
         if self.input is None:
-            return self.output(th.cat([features, actions.expand(self.n_critics, *actions.shape)], dim=-1))
-        return self.output(self.hidden(self.input(features, actions)))
+            rows = actions.flatten(0, -2)
+            x = th.cat([features.repeat(1, len(rows) // features.shape[1], 1), rows.expand(self.n_critics, -1, -1)], dim=-1)
+        else:
+            x = self.hidden(self.input(features, actions))
+        q = self.output(x)
+        return q if actions.dim() == 2 else q.unflatten(1, actions.shape[:2])
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {

@@ -84,11 +84,15 @@ class EnsembleInput(nn.Module):
     def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
         :param features: shape (N, B, F)
-        :param actions: shape (B, A)
-        :return: shape (N, B, H)
+        :param actions: shape (B, A), or (K, B, A) for K actions to each row of features, whose product is computed once
+        :return: shape (N, B, H), or (N, K B, H)
         """
         x = th.bmm(features, self.features_weight)
-        return th.baddbmm(x, actions.expand(len(features), *actions.shape), self.actions_weight) + self.bias
+        if actions.dim() == 2:
+            return th.baddbmm(x, actions.expand(len(features), *actions.shape), self.actions_weight) + self.bias
+        rows = actions.flatten(0, 1)
+        of_actions = th.bmm(rows.expand(len(features), *rows.shape), self.actions_weight).unflatten(1, actions.shape[:2])
+        return (of_actions + (x + self.bias)[:, None]).flatten(1, 2)
 
 
 class EnsembleOutput(nn.Module):

@@ -254,6 +254,8 @@ def make_coefficient(
     bounds: tuple[float, float],
     learning_rate: float,
     device: th.device,
+    kind: type[LearnedCoefficient] = DualVariable,
+    shape: tuple[int, ...] = (),
 ) -> Coefficient:
     """
     Build a coefficient from what the user wrote.
@@ -264,6 +266,8 @@ def make_coefficient(
     :param bounds: smallest and largest value of a learned coefficient
     :param learning_rate: of a learned coefficient
     :param device: where its tensor lives
+    :param kind: of a learned coefficient: exp(x) or softplus(x)
+    :param shape: of a learned coefficient: () for one, (A,) for one of each action dimension
     :raises ValueError: if ``spec`` or ``bounds`` is none of what is allowed
     """
     remedy = f'{name} must be "auto", "auto_<start value>" such as "auto_0.5", or a number >= 0, got {spec!r}.'
@@ -275,7 +279,7 @@ def make_coefficient(
         raise ValueError(
             f'The start value of {name}={spec!r} lies outside {name}_bounds={bounds}: give another one, or {name}="auto".'
         )
-    return DualVariable(name, min(max(initial, low), high), (low, high), learning_rate, device)
+    return kind(name, min(max(initial, low), high), (low, high), learning_rate, device, shape)
 
 
 def _parse(text: Any, remedy: str, allow_zero: bool) -> float:

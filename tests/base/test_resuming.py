@@ -18,7 +18,7 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_gac import GAC, RMA, AsymmetricSAC, CheckpointError, GACShare
+from sb3_gac import GAC, RMA, AsymmetricMPO, AsymmetricSAC, CheckpointError, GACShare
 from sb3_gac.envs import SensorNoise
 from sb3_gac.replay.buffer import CUT
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
@@ -54,6 +54,8 @@ CASES = {  # name -> environment, algorithm and arguments
     "independent": (_bandits, GAC, {"guider": "independent"}),
     "share": (_bandits, GACShare, {}),
     "asymmetric SAC": (lambda: _bandits(3), AsymmetricSAC, {"gradient_steps": 2}),
+    "asymmetric MPO": (_hopper, AsymmetricMPO, {"n_actions": 4}),
+    "asymmetric MPO, recurrent": (lambda: DummyVecEnv([Recall] * 2), AsymmetricMPO, GRU),
     "discrete": (lambda: _bandits(2, TwoViewChoice), GAC, {}),
     "recurrent": (lambda: DummyVecEnv([Recall] * 2), GAC, GRU),
     "two phases": (lambda: _bandits(2), RMA, {"history": 4, "buffer_size": 100}),

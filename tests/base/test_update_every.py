@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import GAC, AsymmetricMPO, AsymmetricSAC, GACShare, GACWithoutQ
 from sb3_gac.base import update
 from tests.helpers import TwoViewBandit, small_model
 
@@ -44,7 +44,7 @@ def _moved(model, rounds):
     return moved
 
 
-@pytest.mark.parametrize("cls", [GAC, GACShare, GACWithoutQ, AsymmetricSAC])
+@pytest.mark.parametrize("cls", [GAC, GACShare, GACWithoutQ, AsymmetricSAC, AsymmetricMPO])
 @pytest.mark.parametrize("rounds", [(6,), (1,) * 6, (4, 2)])
 def test_policies_are_delayed_over_all_gradient_steps(cls, rounds):
     model = _model(cls, policy_delay=3)

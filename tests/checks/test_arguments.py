@@ -8,7 +8,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_gac import COSIL, GAC, AsymmetricSAC, GPOClip, GPOPenalty
+from sb3_gac import COSIL, GAC, AsymmetricMPO, AsymmetricSAC, GPOClip, GPOPenalty
 from sb3_gac.checks.arguments import HANDED_ON, merged, unless
 from sb3_gac.checks.values import check_fraction, check_positive
 from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
@@ -146,10 +146,26 @@ PENALTYS_OWN = {
     "target_kl": ([0, -1, NAN, INF, None], "target_kl must be a number > 0"),
     "largest_kl_coef": ([0, -1, NAN, INF, None], "largest_kl_coef must be a number > 0"),
 }
+MPOS_OWN = {
+    "n_actions": ([0, -1, 2.5, "many", None], "n_actions must be an integer >= 1"),
+    "temperature": (
+        [0, -1, NAN, INF, None, "warm", "auto_0", "auto_1e9"],
+        'temperature( must be a number > 0, or "auto"| must be "auto"|=.*outside temperature_bounds)',
+    ),
+    "kl_coef": (["automatic", "auto_1e7", -1, NAN, None], "kl_coef(=.*outside kl_coef_bounds| must be)"),
+    "std_kl_coef": (["automatic", "auto_0", -1, NAN, None], "std_kl_coef must be"),
+    **{
+        name: ([0, -1, NAN, INF, "small", None], f"{name} must be a number > 0")
+        for name in ("target_improvement", "target_kl", "target_std_kl", "dual_learning_rate")
+    },
+    "ent_coef": ([0.1, 0, "auto_0.1", None], "AsymmetricMPO has no entropy term, so ent_coef would do nothing"),
+    "target_entropy": (["sac", -1.0], "AsymmetricMPO has no entropy term, so target_entropy would do nothing"),
+}
 ARGUMENTS = {
     GAC: {**SHARED, **GACS_OWN},
     AsymmetricSAC: {**SHARED, **SACS_OWN},
     COSIL: {**SHARED, **COSILS_OWN},
+    AsymmetricMPO: {**SHARED, **MPOS_OWN},
     GPOClip: {**ON_POLICY, **CLIPS_OWN},
     GPOPenalty: {**ON_POLICY, **PENALTYS_OWN},
 }
@@ -181,7 +197,7 @@ def test_no_argument_is_forgotten(cls):
 
 #: Checked where they are used, with what they depend on: by the set-up, or by what is made of them
 NOT_IN_TABLES = {"policy", "env", "ent_coef", "target_entropy"}
-NOT_IN_TABLES |= {"kl_coef", "kl_coef_bounds", "teacher", "teacher_coef", "teacher_coef_bounds"}
+NOT_IN_TABLES |= {"kl_coef", "kl_coef_bounds", "teacher", "teacher_coef", "teacher_coef_bounds", "std_kl_coef"}
 
 
 @pytest.mark.parametrize("cls", ARGUMENTS)
@@ -238,6 +254,8 @@ def test_what_is_at_the_edge_of_its_range_is_taken_again_and_again(cls, tmp_path
     }
     if cls is GAC:
         arguments |= {"target_kl": lambda left: 0.01 * left, "learner_kl_scale": 0, "kl_coef": "auto_100"}
+    if cls is AsymmetricMPO:
+        arguments |= {"n_actions": 1, "temperature": "auto_1e6", "kl_coef": 0, "std_kl_coef": "auto_1e-8"}
     if cls is COSIL:
         small_model(cls=AsymmetricSAC).save(tmp_path / "teacher.zip")
         arguments |= {"teacher": tmp_path / "teacher.zip", "target_divergence": 0, "teacher_coef": "auto_100"}

@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, DivergenceError
+from sb3_gac import GAC, AsymmetricMPO, AsymmetricSAC, DivergenceError
 from sb3_gac.checks.divergence import check_finite_metrics
 from tests.helpers import TwoViewBandit, small_model
 
@@ -107,9 +107,10 @@ def test_observations_are_diagnosed_as_the_networks_see_them(tmp_path):
     assert raised.value.diagnosis["largest_in_a_batch"]["partial"] == pytest.approx(0.01)
 
 
-def test_the_check_costs_no_host_transfer(monkeypatch):
+@pytest.mark.parametrize("cls", [GAC, AsymmetricMPO])
+def test_the_check_costs_no_host_transfer(cls, monkeypatch):
     """One in a round of gradient steps, that of the metrics."""
-    model = small_model(learning_starts=1000).learn(64)
+    model = small_model(cls=cls, learning_starts=1000).learn(64)
     transfers = []
     for name in ("item", "tolist", "__float__", "__bool__", "cpu", "numpy"):
         original = getattr(th.Tensor, name)

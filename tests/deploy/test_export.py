@@ -16,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_gac
-from sb3_gac import GAC, AsymmetricSAC, DeploymentNormalizer, OnnxPolicy, export_learner
+from sb3_gac import GAC, AsymmetricMPO, AsymmetricSAC, DeploymentNormalizer, OnnxPolicy, export_learner
 from sb3_gac.deploy.verification import ExportError, draw_observations
 from sb3_gac.envs import History
 from sb3_gac.networks.encoders import VectorExtractor
@@ -56,6 +56,7 @@ KINDS = {
     "ranges": lambda: small_model(Scaled()),
     "discrete": lambda: small_model(TwoViewChoice(length=5)),
     "asymmetric": lambda: small_model(TwoViewBandit(length=5), cls=AsymmetricSAC),
+    "asymmetric MPO": lambda: small_model(Scaled(), cls=AsymmetricMPO),
     "normalised": lambda: small_model(_normalised()),
     "image": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN),
     "image, shared encoder": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN | SHARED),

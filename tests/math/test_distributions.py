@@ -94,6 +94,59 @@ def test_kl_of_any_two_gaussians_is_torchs_own(dtype):
     assert all((leaf.grad != 0).all() for leaf in leaves)
 
 
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+def test_kl_by_dimension_is_what_the_kl_sums_up(reduction):
+    one, other = (TanhGaussian(th.randn(5, 3), 0.5 * th.randn(5, 3)) for _ in range(2))
+    th.testing.assert_close(getattr(one.kl_by_dimension(other), reduction)(dim=-1), one.kl(other, reduction))
+    assert one.kl_by_dimension(other).shape == (5, 3)
+    one, other = (Categorical(th.randn(5, 3)) for _ in range(2))
+    assert th.equal(one.kl_by_dimension(other), one.kl(other)[:, None])
+
+
+def test_kl_of_nearly_the_same_std_is_not_lost_in_rounding():
+    """Of stds that differ by a thousandth it is a millionth."""
+    log_std = th.linspace(-2, 0.5, 101)[:, None]
+    one, other = (TanhGaussian(th.zeros(101, 1), log_std + shift) for shift in (0.0, 1e-3))
+    exact = other.log_std.double() - one.log_std.double()
+    exact = exact + 0.5 * th.expm1(-2 * exact)
+    assert ((one.kl(other).double() / exact[:, 0] - 1).abs() < 1e-3).all()
+
+
+def test_decoupled_parts_move_mean_or_std_alone():
+    mean, log_std = (th.randn(4, 2).requires_grad_() for _ in range(2))
+    anchor = TanhGaussian(th.randn(4, 2), th.randn(4, 2))
+    of_mean, of_std = TanhGaussian(mean, log_std).decoupled(anchor)
+    assert (of_mean.mean is mean, of_mean.log_std is anchor.log_std) == (True, True)
+    assert (of_std.mean is anchor.mean, of_std.log_std is log_std) == (True, True)
+    choice = Categorical(th.randn(4, 3))
+    assert choice.decoupled(Categorical(th.randn(4, 3))) == (choice,)
+
+
+@pytest.mark.parametrize("leading", [(5,), (2, 5)])
+def test_candidates_are_samples_with_the_smallest_critics_values(leading):
+    one, other = (TanhGaussian(th.randn(*leading, 3), 0.5 * th.randn(*leading, 3)) for _ in range(2))
+    noise = th.randn(7, *leading, 3)
+    candidates = one.candidates(lambda actions: th.stack([actions.sum(dim=-1), actions[..., 0]]), noise)
+    x = one.mean + one.log_std.exp() * noise
+    values = th.minimum(th.tanh(x).sum(dim=-1), th.tanh(x)[..., 0]).movedim(0, -1)
+    th.testing.assert_close(candidates.values, values)
+    th.testing.assert_close(candidates.mean_value, values.mean(dim=-1)[None])
+    expected = th.distributions.Normal(other.mean, other.log_std.exp()).log_prob(x).sum(dim=-1).movedim(0, -1)
+    th.testing.assert_close(other.log_likelihood(candidates), expected)
+    jacobian = (1 - th.tanh(x).double().square()).log().sum(dim=-1).movedim(0, -1).float()
+    of_actions = th.stack([other.log_prob(each) for each in x], dim=-1)
+    th.testing.assert_close(expected - jacobian, of_actions, rtol=1e-3, atol=1e-3)
+
+
+def test_candidates_among_choices_are_all_of_them_by_their_probabilities():
+    one, other = (Categorical(th.randn(5, 3)) for _ in range(2))
+    q = th.randn(2, 5, 3)
+    candidates = one.candidates(lambda actions: q if actions is None else None, th.empty(0))
+    assert th.equal(candidates.values, q.amin(dim=0))
+    th.testing.assert_close(candidates.mean_value, one.value_and_log_prob(lambda actions: q, th.empty(0))[0])
+    th.testing.assert_close(other.log_likelihood(candidates), other.logits.log_softmax(dim=-1))
+
+
 def test_kl_of_means_is_the_kl_of_a_shared_std_and_moves_no_std():
     mean, other_mean = th.tensor([[0.5, -1.0]], requires_grad=True), th.tensor([[0.0, 1.0]], requires_grad=True)
     log_std = th.tensor([[0.2, -0.3]], requires_grad=True)

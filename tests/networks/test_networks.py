@@ -53,6 +53,28 @@ def test_ensemble_is_so_many_separate_networks(net_arch):
     th.testing.assert_close(*gradients)
 
 
+@pytest.mark.parametrize("net_arch", [[8, 6], [8], []])
+def test_several_actions_of_each_observation_are_valued_as_if_they_came_one_by_one(net_arch):
+    """Of observations and of sequences of them; and their gradients."""
+    critics = _critics(net_arch)
+    for leading in ((5,), (4, 5)):
+        obs, actions = {"a": th.randn(*leading, 2), "b": th.randn(*leading, 3)}, th.rand(7, *leading, 2, requires_grad=True)
+        q = critics(obs, actions)
+        assert q.shape == (3, 7, *leading)
+        one_by_one = th.stack([critics(obs, each) for each in actions], dim=1)
+        th.testing.assert_close(q, one_by_one)
+        gradients = [th.autograd.grad(values.square().sum(), actions)[0] for values in (q, one_by_one)]
+        th.testing.assert_close(*gradients)
+
+
+def test_the_observations_part_of_the_first_layer_is_computed_once_for_all_their_actions(monkeypatch):
+    critics, products = _critics([8]), []
+    bmm = th.bmm
+    monkeypatch.setattr(th, "bmm", lambda x, weight: products.append(x.shape) or bmm(x, weight))
+    critics({"a": th.randn(5, 2), "b": th.randn(5, 3)}, th.rand(7, 5, 2))
+    assert products == [(3, 5, 5), (3, 35, 2)]
+
+
 def test_ensemble_members_start_different_and_within_torchs_bounds():
     critics = _critics([64, 64])
     first = (critics.input.features_weight, critics.input.actions_weight, critics.input.bias)

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricSAC
+from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricMPO, AsymmetricSAC
 from sb3_gac.optim.compile import Program
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
 
@@ -36,7 +36,7 @@ def _assert_equal(model, other, **tolerance):
         th.testing.assert_close(coefficient.value, other.coefficients[name].value, **tolerance)
 
 
-@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL, COSIL])
+@pytest.mark.parametrize("cls", [GAC, AsymmetricSAC, TGRL, COSIL, AsymmetricMPO])
 def test_compiled_training_is_plain_training(cls, tmp_path):
     """Through other batch sizes and settings, new weights, a copy of the policy and a save: nothing stale is used."""
     plain, compiled = _filled(cls), _filled(cls, compile=True)
@@ -90,6 +90,7 @@ KINDS = {
         role_keys={"critic": ["privileged"]},
         **arguments,
     ),
+    "MPO, discrete": lambda **arguments: _filled(AsymmetricMPO, env=TwoViewChoice(), **arguments),
     "guider's std, pulled": lambda **arguments: _filled(GAC, shared_std="guider", learner_kl_scale=1.0, **arguments),
 }
 

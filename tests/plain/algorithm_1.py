@@ -133,6 +133,8 @@ class PlainAlgorithm:
     :param settings: of the model
     """
 
+    settings_class: type[Settings] = Settings
+
     def __init__(self, policy: Any, names: list[str], settings: Settings):
         self.settings = settings
         self.networks: dict[str, Any] = {name: self.copied(policy, name) for name in names}
@@ -142,6 +144,7 @@ class PlainAlgorithm:
             for name, network in self.networks.items()
         }
         self.beta = Coefficient("ent_coef", settings.ent_coef, settings.learning_rate)
+        self.coefficients: dict[str, Any] = {"ent_coef": self.beta}
         self.discrete = not hasattr(policy.action_space, "low")
         self.n_steps_done = 0
         self.logged: dict[str, th.Tensor] = {}
@@ -240,6 +243,7 @@ class PlainGAC(PlainAlgorithm):
         names = ["guider_critic", "guider", "learner"] + ["learner_critic"] * (policy.learner_critic is not None)
         super().__init__(policy, names, settings)
         self.alpha = Coefficient("kl_coef", settings.kl_coef, settings.kl_coef_learning_rate, settings.kl_coef_bounds)
+        self.coefficients["kl_coef"] = self.alpha
         self.theta, self.theta_bar = self.networks["guider_critic"], self.targets["guider_critic_target"]
         self.phi = self.networks.get("learner_critic", self.theta)
         self.phi_bar = self.targets.get("learner_critic_target")

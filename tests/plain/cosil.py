@@ -25,6 +25,7 @@ class PlainCOSIL(PlainAlgorithm):
         self.teacher = plain_policy(teacher)
         rate, bounds = settings.teacher_coef_learning_rate, settings.teacher_coef_bounds
         self.alpha = Coefficient("teacher_coef", settings.teacher_coef, rate, bounds)
+        self.coefficients = {"teacher_coef": self.alpha}
 
     @staticmethod
     def distance(student: Any, teacher: Any) -> th.Tensor:
