@@ -127,10 +127,6 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
         self.dual_learning_rate = dual_learning_rate
         super().__init__(policy, env, *sb3, **shared)
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        self.target_entropy = "auto"  # of nothing: no number takes its place
-
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The temperature, and the weights of the KLs, one for each action dimension."""
         box = isinstance(self.action_space, spaces.Box)
@@ -144,7 +140,7 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
         }
 
     def refresh_schedules(self) -> None:
-        """See :meth:`NetworkTraining.refresh_schedules`; the duals' rate is what the argument says, whatever a file said."""
+        """See :meth:`GradientSteps.refresh_schedules`; the duals' rate is what the argument says, whatever a file said."""
         for coefficient in self.coefficients.values():
             if coefficient.optimizer is not None:
                 coefficient.optimizer.param_groups[0]["lr"] = self.dual_learning_rate
