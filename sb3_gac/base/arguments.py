@@ -21,6 +21,22 @@ from sb3_gac.base.roles import RoleKeys
 from sb3_gac.checks.arguments import merged
 
 
+class CommonArguments(TypedDict, total=False):
+    """What on- and off-policy algorithms share, keyword-only: each a type and a default."""
+
+    lr_scales: Annotated[Mapping[str, float] | None, None]
+    role_keys: Annotated[RoleKeys | None, None]
+    compile: Annotated[bool, False]
+    mixed_precision: Annotated[bool, False]
+    stats_window_size: Annotated[int, 100]
+    tensorboard_log: Annotated[str | None, None]
+    policy_kwargs: Annotated[dict[str, Any] | None, None]
+    verbose: Annotated[int, 0]
+    seed: Annotated[int | None, None]
+    device: Annotated[th.device | str, "auto"]
+    _init_setup_model: Annotated[bool, True]
+
+
 class PositionalArguments(TypedDict, total=False):
     """What SB3's SAC takes after ``policy`` and ``env``, in its order: each a type and a default."""
 
@@ -42,7 +58,16 @@ class PositionalArguments(TypedDict, total=False):
     target_entropy: Annotated[str | float, "auto"]
 
 
-class OffPolicyArguments(PositionalArguments, total=False):
+class _OffPolicyArguments(PositionalArguments, total=False):
+    max_grad_norm: Annotated[float | None, 1.0]
+    policy_delay: Annotated[int, 1]
+    update_every: Annotated[Mapping[str, int] | None, None]
+    behaviour: Annotated[BehaviourSpec, None]
+    behaviour_per: Annotated[str, "episode"]
+    recording: Annotated[str | PathLike | None, None]
+
+
+class OffPolicyArguments(_OffPolicyArguments, CommonArguments, total=False):
     """
     All that off-policy algorithms share but ``policy`` and ``env``, described by ``AsymmetricOffPolicyAlgorithm``.
 
@@ -52,24 +77,6 @@ class OffPolicyArguments(PositionalArguments, total=False):
             self.teacher, self.coef_step = teacher, coef_step
             super().__init__(policy, env, *sb3, **shared)
     """
-
-    max_grad_norm: Annotated[float | None, 1.0]
-    policy_delay: Annotated[int, 1]
-    update_every: Annotated[Mapping[str, int] | None, None]
-    behaviour: Annotated[BehaviourSpec, None]
-    behaviour_per: Annotated[str, "episode"]
-    recording: Annotated[str | PathLike | None, None]
-    lr_scales: Annotated[Mapping[str, float] | None, None]
-    role_keys: Annotated[RoleKeys | None, None]
-    compile: Annotated[bool, False]
-    mixed_precision: Annotated[bool, False]
-    stats_window_size: Annotated[int, 100]
-    tensorboard_log: Annotated[str | None, None]
-    policy_kwargs: Annotated[dict[str, Any] | None, None]
-    verbose: Annotated[int, 0]
-    seed: Annotated[int | None, None]
-    device: Annotated[th.device | str, "auto"]
-    _init_setup_model: Annotated[bool, True]
 
 
 class PositionalOnPolicyArguments(TypedDict, total=False):
@@ -87,23 +94,14 @@ class PositionalOnPolicyArguments(TypedDict, total=False):
     vf_coef: Annotated[float, 0.25]
 
 
-class OnPolicyArguments(PositionalOnPolicyArguments, total=False):
-    """All that on-policy algorithms share but ``policy`` and ``env``, described by ``AsymmetricOnPolicyAlgorithm``."""
-
+class _OnPolicyArguments(PositionalOnPolicyArguments, total=False):
     max_grad_norm: Annotated[float | None, 1.0]
     reward_scale: Annotated[float, 1.0]
     unroll_length: Annotated[int | None, None]
-    lr_scales: Annotated[Mapping[str, float] | None, None]
-    role_keys: Annotated[RoleKeys | None, None]
-    compile: Annotated[bool, False]
-    mixed_precision: Annotated[bool, False]
-    stats_window_size: Annotated[int, 100]
-    tensorboard_log: Annotated[str | None, None]
-    policy_kwargs: Annotated[dict[str, Any] | None, None]
-    verbose: Annotated[int, 0]
-    seed: Annotated[int | None, None]
-    device: Annotated[th.device | str, "auto"]
-    _init_setup_model: Annotated[bool, True]
+
+
+class OnPolicyArguments(_OnPolicyArguments, CommonArguments, total=False):
+    """All that on-policy algorithms share but ``policy`` and ``env``, described by ``AsymmetricOnPolicyAlgorithm``."""
 
 
 def _signature(shared: type, positional: type) -> inspect.Signature:

@@ -3,13 +3,14 @@
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, GymEnv, PyTorchObs
+from stable_baselines3.common.type_aliases import DictRolloutBufferSamples as Samples
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 from torch import nn
 from typing_extensions import Unpack
 
@@ -27,6 +28,7 @@ from sb3_gac.networks.role_model import RoleModel
 from sb3_gac.networks.values import StateValue
 from sb3_gac.optim.coefficients import Coefficient, MultiplicativeCoefficient
 
+Weights: TypeAlias = Mapping[str, th.Tensor]
 LARGEST_LOG_RATIO = 10.0
 FIRST_KL_COEF, KL_COEF_FACTOR = 0.1, 1.2
 
@@ -155,26 +157,19 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
 
     # --- algorithm ----------------------------------------------------------------------------------------------------
 
-    def update(self, batch: DictRolloutBufferSamples) -> Metrics:
+    def update(self, batch: Samples) -> Metrics:
         """One step of all networks; policies share one, so their objectives are one loss."""
         noise = th.randn(*batch.actions.shape, device=self.device)
-        coefficients = {name: coefficient.value for name, coefficient in self.coefficients.items()}
-        tensors = (batch, self.advantages(batch), noise, self.clip_range_tensor, coefficients)
-        metrics = self.minimize(("learner", "guider", "critic"), self.loss, *tensors)
+        weights = {name: coefficient.value for name, coefficient in self.coefficients.items()}
+        batch = batch._replace(advantages=self.advantages(batch))
+        metrics = self.minimize(("learner", "guider", "critic"), self.loss, batch, noise, self.clip_range_tensor, weights)
         return metrics | self.coefficient_values()
 
-    def loss(
-        self,
-        batch: DictRolloutBufferSamples,
-        advantages: th.Tensor,
-        noise: th.Tensor,
-        epsilon: th.Tensor,
-        coefficients: Mapping[str, th.Tensor],
-    ) -> Loss:
+    def loss(self, batch: Samples, noise: th.Tensor, epsilon: th.Tensor, weights: Weights) -> Loss:
         """All objectives together, with the guider's entropy and the value's mean squared error."""
         guider, learner = (getattr(self.policy, role).distribution(batch.observations) for role in ("guider", "learner"))
-        guider_loss = self.guider_objective(batch, guider, learner.detach(), advantages, epsilon, coefficients)
-        learner_loss = self.learner_objective(batch, guider.detach(), learner, advantages, epsilon)
+        guider_loss = self.guider_objective(batch, guider, learner.detach(), epsilon, weights)
+        learner_loss = self.learner_objective(batch, guider.detach(), learner, epsilon)
         value_loss = (self.policy.critic(batch.observations) - batch.returns).square().mean()
         entropy = guider.entropy(noise).mean()
         loss = guider_loss + learner_loss - self.ent_coef * entropy + self.vf_coef * value_loss
@@ -183,32 +178,21 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
         return Loss(loss, {**parts, "entropy": entropy, "kl": kl})
 
     @abstractmethod
-    def guider_objective(
-        self,
-        batch: DictRolloutBufferSamples,
-        guider: Any,
-        learner: Any,
-        advantages: th.Tensor,
-        epsilon: th.Tensor,
-        coefficients: Mapping[str, th.Tensor],
-    ) -> th.Tensor:
+    def guider_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor, weights: Weights) -> th.Tensor:
         """
-        :param batch: B transitions
+        :param batch: B transitions, with normalised advantages
         :param guider: with its gradient, shapes (B, A)
         :param learner: as a constant, shapes (B, A)
-        :param advantages: shape (B,)
         :param epsilon: how far a ratio may count
-        :param coefficients: by name
+        :param weights: values of the coefficients
         :return: what the guider minimises, scalar
         """
 
-    def learner_objective(
-        self, batch: DictRolloutBufferSamples, guider: Any, learner: Any, advantages: th.Tensor, epsilon: th.Tensor
-    ) -> th.Tensor:
+    def learner_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor) -> th.Tensor:
         """Imitate the guider, and climb its advantages."""
         log_ratio = (learner.log_prob(batch.actions) - batch.old_log_prob).clamp(max=LARGEST_LOG_RATIO)
         imitation = guider.kl(learner, "mean").mean()
-        return imitation + self.learner_rl_coef * clipped_surrogate(log_ratio, advantages, epsilon)
+        return imitation + self.learner_rl_coef * clipped_surrogate(log_ratio, batch.advantages, epsilon)
 
 
 class GPOClip(GPO):
@@ -226,21 +210,13 @@ class GPOClip(GPO):
         self.delta = delta
         super().__init__(policy, env, *sb3, **shared)
 
-    def guider_objective(
-        self,
-        batch: DictRolloutBufferSamples,
-        guider: Any,
-        learner: Any,
-        advantages: th.Tensor,
-        epsilon: th.Tensor,
-        coefficients: Mapping[str, th.Tensor],
-    ) -> th.Tensor:
+    def guider_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor, weights: Weights) -> th.Tensor:
         """PPO whose ratio is clipped near the learner first, and a KL where the guider has left the learner's vicinity."""
         log_prob, log_learner = guider.log_prob(batch.actions), learner.log_prob(batch.actions)
         log_distance = log_prob - log_learner
         nearby = log_distance.clamp(math.log(1 - self.delta), math.log(1 + self.delta))
         surrogate = clipped_surrogate(
-            log_prob - batch.old_log_prob, advantages, epsilon, clipped_from=log_learner + nearby - batch.old_log_prob
+            log_prob - batch.old_log_prob, batch.advantages, epsilon, clipped_from=log_learner + nearby - batch.old_log_prob
         )
         has_left = (log_distance != nearby).float()
         return surrogate + (has_left * guider.kl(learner, "mean")).mean()
@@ -279,18 +255,10 @@ class GPOPenalty(GPO):
         kl_coef = MultiplicativeCoefficient(FIRST_KL_COEF, KL_COEF_FACTOR, self.largest_kl_coef, self.device)
         return {"kl_coef": kl_coef}
 
-    def guider_objective(
-        self,
-        batch: DictRolloutBufferSamples,
-        guider: Any,
-        learner: Any,
-        advantages: th.Tensor,
-        epsilon: th.Tensor,
-        coefficients: Mapping[str, th.Tensor],
-    ) -> th.Tensor:
+    def guider_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor, weights: Weights) -> th.Tensor:
         """PPO, and a KL to the learner."""
-        surrogate = clipped_surrogate(guider.log_prob(batch.actions) - batch.old_log_prob, advantages, epsilon)
-        return surrogate + coefficients["kl_coef"] * guider.kl(learner, "mean").mean()
+        surrogate = clipped_surrogate(guider.log_prob(batch.actions) - batch.old_log_prob, batch.advantages, epsilon)
+        return surrogate + weights["kl_coef"] * guider.kl(learner, "mean").mean()
 
     def train(self) -> None:
         """See :meth:`AsymmetricOnPolicyAlgorithm.train`; then the KL's weight takes a step."""

@@ -182,7 +182,7 @@ def test_a_gradient_step_is_that_of_the_papers_one_network(cls):
     batch = next(model.rollout_buffer.get(64))
     noise = th.randn(64, 1)
     coefficients = {name: coefficient.value for name, coefficient in model.coefficients.items()}
-    loss = model.loss(batch, model.advantages(batch), noise, th.tensor(0.3), coefficients)
+    loss = model.loss(batch._replace(advantages=model.advantages(batch)), noise, th.tensor(0.3), coefficients)
     expected = plain.loss(batch, noise, 0.3)
     assert loss.value.item() == pytest.approx(expected.item(), rel=1e-4)
     loss.value.backward()
