@@ -167,8 +167,7 @@ class RMA(AsymmetricOffPolicyAlgorithm):
         """Phase 1: SAC's, with z in place of what is privileged. Phase 2: the estimate of z."""
         if self.phase == 2:
             return self.minimize("adaptation", self.adaptation_loss, batch)
-        ent_coef = self.coefficients["ent_coef"]
-        beta = ent_coef.value
+        ent_coef, beta = self.coefficients["ent_coef"], self.coefficients["ent_coef"].value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
         metrics = self.minimize(("critic", "expert"), self.critic_loss, batch, noise[0], beta)
         metrics |= self.minimize(("actor", "expert"), self.actor_loss, batch, noise[1], beta)

@@ -441,6 +441,8 @@ def test_the_expert_is_the_actor_with_the_true_z_and_the_encoder_is_the_critics(
     assert own["actor"] == {id(p) for part in (policy.actor.latent_net, policy.actor.head) for p in part.parameters()}
     targets = {id(p) for p in policy.critic_target.parameters()}
     assert not targets & set().union(*own.values())
+    widths = [policy.critic.input.features_weight.shape[1], policy.expert.features_extractor.features_dim]
+    assert widths == [2 + 3, 2 + 3], "z in place of what is encoded"
     obs = {"partial": th.randn(5, 2), "privileged": th.randn(5, 1)}
     z = policy.expert.extract_features(obs, policy.expert.features_extractor)[:, 2:]
     assert z.shape == (5, 3)
