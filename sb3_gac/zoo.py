@@ -62,8 +62,7 @@ def sample(name: str, trial: optuna.Trial, n_actions: int, n_envs: int, addition
     :param n_envs: unused
     :param additional_args: unused
     """
-    kind = algorithm_class(name)
-    families = {"all", *map(name_of, kind.__mro__)}
+    families = {"all", *map(name_of, algorithm_class(name).__mro__)}
     suggested = [suggest(trial) for family, suggest in SUGGESTIONS.items() if family in families]
     return convert({argument: value for arguments in suggested for argument, value in arguments.items()})
 

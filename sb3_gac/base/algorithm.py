@@ -31,7 +31,7 @@ from sb3_gac.checks.arguments import (
 )
 from sb3_gac.checks.values import plain
 from sb3_gac.networks.heads import check_action_space
-from sb3_gac.optim.coefficients import Coefficient, DualVariable
+from sb3_gac.optim.coefficients import Coefficient, DualVariable, LearnedCoefficient
 from sb3_gac.optim.compile import check_can_compile
 from sb3_gac.optim.parallel import has_side_effects
 from sb3_gac.replay.source import ReplaySource
@@ -261,7 +261,7 @@ class AsymmetricAlgorithm(
             spec_now = getattr(self, name, None)
             if not any(other.startswith(name) for other in given):
                 self.coefficients[name] = coefficient
-            elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, DualVariable)):
+            elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, LearnedCoefficient)):
                 self.coefficients[name].go_on_from(coefficient)
         self._keep_coefficients()
         if "lr_scales" in given:

@@ -308,6 +308,8 @@ def test_saved_and_loaded_it_goes_on_and_takes_other_arguments(tmp_path):
     assert before == values["temperature"].item()
     loaded.learn(10, reset_num_timesteps=False)
     assert abs(loaded.coefficients["temperature"].value.item() - before) > 2.0, "at the rate that was given"
+    loaded = AsymmetricMPO.load(tmp_path / "model", env=TWO_ACTIONS, kl_coef="auto")
+    assert th.equal(loaded.coefficients["kl_coef"].value, values["kl_coef"]), "learned before and after"
 
 
 @pytest.mark.parametrize("setting", ["n_actions", "target_improvement", "target_kl", "target_std_kl"])
