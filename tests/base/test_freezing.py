@@ -11,6 +11,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac.base.update import scale_of
 from sb3_gac.optim.trained import TrainedParameters
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
 
@@ -150,7 +151,9 @@ def test_freezing_a_part_is_training_without_it(optimizer_class, options):
                 theirs[0] = optimizer_class(twin[0].parameters(), lr=0.01, weight_decay=0.1)
         trained.refresh()
         x = th.randn(8, 3)
-        norm = trained.step(th.autograd.grad(network(x).square().sum(), trained.parameters), max_norm=0.5)
+        gradients = th.autograd.grad(network(x).square().sum(), trained.parameters)
+        norm = trained.norm(gradients)
+        trained.step(gradients, scale_of([norm], 0.5))
         for optimizer in theirs:
             optimizer.zero_grad()
         twin(x).square().sum().backward()
@@ -164,7 +167,9 @@ def test_freezing_a_part_is_training_without_it(optimizer_class, options):
 def test_a_step_of_nothing_has_no_gradient():
     nothing = nn.Parameter(th.zeros(2), requires_grad=False)
     trained = TrainedParameters([nothing], th.optim.Adam([nothing], fused=True))
-    assert trained.step([], max_norm=1.0).item() == 0.0
+    assert trained.norm([]).item() == 0.0
+    trained.step([], th.ones(()))
+    assert not nothing.any()
 
 
 @pytest.mark.parametrize("optimizer", [(th.optim.SGD, {"momentum": 0.9}), (th.optim.AdamW, {}), (th.optim.RMSprop, {})])
