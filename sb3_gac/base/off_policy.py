@@ -18,13 +18,13 @@ from typing_extensions import Self, Unpack
 
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.base.arguments import OffPolicyArguments, with_defaults
+from sb3_gac.base.batch import Batch, Metrics
 from sb3_gac.base.behaviour import Behaviour, BehaviourSpec
 from sb3_gac.base.collecting import DataCollection
 from sb3_gac.base.overrides import check_known, check_unchanged
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.recording import Recording
 from sb3_gac.base.roles import RoleKeys, resolve_update_every
-from sb3_gac.base.update import Batch, Metrics
 from sb3_gac.checks.arguments import COMMON_CHECKS, OFF_POLICY_CHECKS, ArgumentCheck, check_train_freq
 from sb3_gac.checks.entries import check_held_by
 from sb3_gac.checks.requirements import check_goals, check_rewards_of_goals

@@ -12,11 +12,11 @@ from typing_extensions import Unpack
 
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.base.arguments import OnPolicyArguments, with_defaults
+from sb3_gac.base.batch import Metrics
 from sb3_gac.base.overrides import check_known
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import RoleKeys
 from sb3_gac.base.rollouts import RolloutCollection
-from sb3_gac.base.update import Metrics
 from sb3_gac.checks.arguments import COMMON_CHECKS, ArgumentCheck, PlainSchedule, check_switch, unless
 from sb3_gac.checks.values import check_fraction, check_integer, check_not_negative, check_positive, check_schedule
 

@@ -11,10 +11,10 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 from typing_extensions import Unpack
 
 from sb3_gac.base.arguments import OffPolicyArguments
+from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
 from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles
-from sb3_gac.base.update import Batch, Loss, Metrics, Outputs
 from sb3_gac.checks.arguments import ArgumentCheck, unless
 from sb3_gac.checks.values import check_not_negative, check_positive
 from sb3_gac.math.distributions import Distribution

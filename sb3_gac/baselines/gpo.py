@@ -15,11 +15,11 @@ from torch import nn
 from typing_extensions import Unpack
 
 from sb3_gac.base.arguments import OnPolicyArguments
+from sb3_gac.base.batch import Loss, Metrics
 from sb3_gac.base.guider import GuiderPrediction
 from sb3_gac.base.on_policy import AsymmetricOnPolicyAlgorithm
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles, role_space
-from sb3_gac.base.update import Loss, Metrics
 from sb3_gac.checks.values import check_inner_fraction, check_not_negative, check_positive
 from sb3_gac.math.distributions import Distribution
 from sb3_gac.math.losses import clipped_surrogate

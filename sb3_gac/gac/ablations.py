@@ -4,7 +4,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_gac.base.update import Batch
+from sb3_gac.base.batch import Batch
 from sb3_gac.gac.gac import GAC
 from sb3_gac.gac.policies import ActionDistributions
 from sb3_gac.math.losses import distillation_loss

@@ -11,9 +11,9 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from typing_extensions import Unpack
 
 from sb3_gac.base.arguments import OffPolicyArguments
+from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
 from sb3_gac.base.guider import GuiderPrediction
 from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
-from sb3_gac.base.update import Batch, Loss, Metrics, Outputs
 from sb3_gac.checks.arguments import ArgumentCheck, PlainSchedule, check_switch, unless
 from sb3_gac.checks.values import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.gac.actors import GUIDERS

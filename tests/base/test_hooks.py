@@ -261,7 +261,7 @@ def test_encoders_by_role():
 
 def test_two_networks_may_share_a_loss():
     """As an encoder that a critic's loss trains: each has its own optimiser and its own bound."""
-    from sb3_gac.base.update import Loss
+    from sb3_gac.base.batch import Loss
 
     model = small_model(learning_starts=1000).learn(30)
     batch = model._sample_batch(8)

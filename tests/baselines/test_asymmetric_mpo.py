@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import configure
 
 from sb3_gac import AsymmetricMPO, DivergenceError, OnnxPolicy, export_learner
-from sb3_gac.base.update import Batch, Outputs
+from sb3_gac.base.batch import Batch, Outputs
 from sb3_gac.checks.divergence import check_finite_metrics
 from sb3_gac.math.distributions import Candidates, Categorical, TanhGaussian
 from sb3_gac.optim.coefficients import SoftplusDual

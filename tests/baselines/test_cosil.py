@@ -6,7 +6,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_gac import COSIL, TGRL, AsymmetricSAC
-from sb3_gac.base.update import Batch
+from sb3_gac.base.batch import Batch
 from sb3_gac.math.distributions import Categorical, TanhGaussian
 from sb3_gac.networks.heads import resolve_target_divergence
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model

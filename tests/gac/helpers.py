@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from sb3_gac.base.update import Batch, Loss
+from sb3_gac.base.batch import Batch, Loss
 
 
 class Step(NamedTuple):
