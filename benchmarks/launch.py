@@ -267,7 +267,8 @@ def in_order(
             else:
                 running.add(submit(job))
         if running:
-            ended, running = wait(running, return_when=FIRST_COMPLETED)
+            # Where another thread gets Ctrl-C's signal, this one learns of it when it next runs
+            ended, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)
             yield from ended
 
 
