@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -12,8 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
+from typing_extensions import Self
 
-Self = TypeVar("Self", bound="RolloutCollection")
 #: Of a rollout buffer, what is filled step by step, besides observations
 _FILLED = ("actions", "rewards", "episode_starts", "values", "log_probs")
 
@@ -197,10 +197,10 @@ class RolloutCollection(OnPolicyAlgorithm):
         :param infos: of the environments
         :return: with the discounted value of the last observation, where a time limit has ended an episode
         """
-        for index in np.flatnonzero(dones).tolist():
-            if infos[index].get("TimeLimit.truncated", False):
-                last = {key: value[None] for key, value in infos[index]["terminal_observation"].items()}
-                rewards[index] += self.gamma * self._values_of(last)[0]
+        cut = [index for index in np.flatnonzero(dones).tolist() if infos[index].get("TimeLimit.truncated", False)]
+        if cut:
+            last = [infos[index]["terminal_observation"] for index in cut]
+            rewards[cut] += self.gamma * self._values_of({key: np.stack([obs[key] for obs in last]) for key in last[0]})
         return rewards
 
     @th.no_grad()
@@ -213,7 +213,7 @@ class RolloutCollection(OnPolicyAlgorithm):
         return self.policy.critic(obs).cpu().numpy()  # type: ignore[operator]
 
     def learn(
-        self: Self,
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 1,
