@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial, wraps
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -20,9 +20,25 @@ from sb3_gac.optim.compile import Program
 from sb3_gac.optim.parallel import Worker, worker
 
 
+class _Step(NamedTuple):
+    """
+    A step that waits for :meth:`GradientSteps.joined`.
+
+    :param networks: see :meth:`GradientSteps.minimize`
+    :param take: what takes it, given the tensors
+    :param tensors: of the loss
+    :param metrics: filled when it has been taken
+    """
+
+    networks: str | tuple[str, ...]
+    take: Callable[..., Metrics]
+    tensors: tuple[Any, ...]
+    metrics: Metrics
+
+
 def _scheduled(minimize: Callable[..., Metrics]) -> Callable[..., Metrics]:
     """
-    Where there is a worker, it takes the steps of the side branch, and their metrics are there when it has been waited for.
+    Where there is a worker, steps wait for :meth:`GradientSteps.joined`, and so do their metrics.
 
     :param minimize: see :meth:`GradientSteps.minimize`
     """
@@ -31,13 +47,9 @@ def _scheduled(minimize: Callable[..., Metrics]) -> Callable[..., Metrics]:
     def scheduled(self: Any, networks: str | tuple[str, ...], loss: Callable[..., Loss], *tensors: Any) -> Metrics:
         if self._worker is None:
             return minimize(self, networks, loss, *tensors)
-        run, metrics = partial(minimize, self, networks, loss), Metrics()
-
-        def step() -> None:
-            metrics.update(self._compiled(networks, run, *tensors) if self.compile else run(*tensors))
-
-        self._worker.submit(step) if self._runs_beside(networks) else step()
-        return metrics
+        step = _Step(networks, partial(minimize, self, networks, loss), tensors, Metrics())
+        self._branches[self._runs_beside(networks)].append(step)
+        return step.metrics
 
     return scheduled
 
@@ -62,6 +74,8 @@ class GradientSteps(BaseAlgorithm):
     _branches_are_independent: bool
     #: Takes the steps of :attr:`AsymmetricPolicy.side_branch`, in a round in which branches run at once
     _worker: Worker | None = None
+    #: Whether beside -> steps that wait for :meth:`joined`, during such a round
+    _branches: dict[bool, list[_Step]]
     _program_key: tuple[Any, ...] = ()
     #: Networks that the gradient step under way leaves as they are, see ``update_every``
     _resting: frozenset[str] = frozenset()
@@ -102,12 +116,28 @@ class GradientSteps(BaseAlgorithm):
 
     def joined(self, *steps: Metrics) -> Metrics:
         """
-        :param steps: what :meth:`minimize` has returned, of steps that may be under way at once
+        Where there is a worker, it takes the steps of the side branch while this thread takes the others.
+
+        :param steps: what :meth:`minimize` has returned
         :return: all of it, when all is done
         """
         if self._worker is not None:
+            beside, here = self._branches[True], self._branches[False]
+            self._branches = {True: [], False: []}
+            self._worker.submit(partial(self._run_branch, beside))
+            self._run_branch(here)
             self._worker.wait()
         return {name: value for step in steps for name, value in step.items()}
+
+    def _run_branch(self, steps: Sequence[_Step]) -> None:
+        """One after the other; compiled, as one program."""
+
+        def run(*tensors: Any) -> list[Metrics]:
+            return [step.take(*own) for step, own in zip(steps, tensors, strict=True)]
+
+        name, tensors = tuple(step.networks for step in steps), [step.tensors for step in steps]
+        for step, found in zip(steps, self._compiled(name, run, *tensors) if self.compile else run(*tensors), strict=True):
+            step.metrics.update(found)
 
     def outputs(self, batch: Batch, *roles: str) -> list[Outputs]:
         """
@@ -183,11 +213,13 @@ class GradientSteps(BaseAlgorithm):
         settings = (getattr(self, name) for name in self.compiled_settings)
         self._program_key = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
         history: list[Metrics] = []
+        self._branches = {True: [], False: []}
         try:
             with worker(self._branches_are_independent and th.get_num_threads() > 1) as self._worker:
                 yield history
         finally:
             self._worker = None
+            del self._branches
         self._record_metrics(history)
 
     @property
@@ -197,7 +229,7 @@ class GradientSteps(BaseAlgorithm):
 
     @property
     def _in_several_programs(self) -> bool:
-        """Whether each step is compiled by itself."""
+        """Whether each branch is compiled by itself."""
         return self.compile and self._worker is not None
 
     def _compiled(self, name: Any, function: Callable[..., Any], *args: Any) -> Any:

@@ -97,7 +97,7 @@ KINDS = {
 
 @pytest.mark.parametrize(("kind", "threads"), [*((kind, 1) for kind in KINDS), ("discrete", 2), ("guider's std, pulled", 2)])
 def test_every_kind_is_compiled_to_what_it_is(kind, threads):
-    """On one thread as one program; on two, steps are programs of their own, and those of a branch run beside the other's."""
+    """On one thread as one program; on two, branches are programs of their own, and run at once."""
     before = th.get_num_threads()
     th.set_num_threads(threads)
     try:
@@ -105,8 +105,9 @@ def test_every_kind_is_compiled_to_what_it_is(kind, threads):
         _train((plain, compiled))
         names = {key[0] for key in compiled.programs}
         branches = threads > 1 and isinstance(compiled, GAC)
-        of_steps = {("outputs", role) for role in ("guider", "learner")} | {*compiled.policy.roles.all}
-        assert names == (of_steps if branches else {"update"})
+        of_branches = {("outputs", "guider"), ("outputs", "learner")}
+        of_branches |= {(f"{role}_critic", role) for role in ("guider", "learner")}
+        assert names == (of_branches if branches else {"update"})
     finally:
         th.set_num_threads(before)
     _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
