@@ -8,9 +8,10 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_gac.base.roles import Roles
 from sb3_gac.checks.values import check_choice
+from sb3_gac.schedules import as_schedule
 
-#: A policy's name, or name -> share of episodes, a number or a schedule; the default policy has the rest
-BehaviourSpec: TypeAlias = str | Mapping[str, float | Schedule] | None
+#: A policy's name, or name -> share of episodes, a number or a schedule, which may be text; the default policy has the rest
+BehaviourSpec: TypeAlias = str | Mapping[str, float | str | Schedule] | None
 
 
 class Behaviour:
@@ -26,7 +27,8 @@ class Behaviour:
 
     def __init__(self, roles: Roles, behaviour: BehaviourSpec, per: str = "episode", frozen: Sequence[str] = ()):
         self.default = behaviour if isinstance(behaviour, str) else roles.behaviour
-        self.shares: dict[str, Any] = dict(behaviour) if isinstance(behaviour, Mapping) else {}
+        shares = behaviour if isinstance(behaviour, Mapping) else {}
+        self.shares: dict[str, Any] = {role: _read_share(role, share) for role, share in shares.items()}
         self.per = per
         for role in (self.default, *self.shares):
             check_choice("behaviour: a policy", role, (*roles.policies, *frozen))
@@ -53,3 +55,10 @@ class Behaviour:
         drawn = np.random.rand(n_envs) if self.per == "episode" else (np.arange(n_envs) + 0.5) / n_envs
         chosen = [next((name for name, limit in zip(names, limits, strict=True) if u < limit), self.default) for u in drawn]
         return [new if starts else old for new, old, starts in zip(chosen, acting, episode_start, strict=True)]
+
+
+def _read_share(role: str, share: Any) -> Any:
+    try:
+        return as_schedule(share)
+    except ValueError as error:
+        raise ValueError(f"behaviour, {role}: {error}") from None

@@ -23,6 +23,7 @@ from sb3_gac.checks.values import (
     check_type,
     plain,
 )
+from sb3_gac.schedules import as_schedule
 
 ArgumentCheck: TypeAlias = Callable[..., None]
 """Takes an argument's name and its value; raises a ValueError that says what is allowed."""
@@ -35,7 +36,14 @@ HANDED_ON = ("policy_kwargs", "replay_buffer_kwargs")
 
 
 class PlainSchedule(FloatSchedule):
-    """A schedule of Python's numbers, whatever its function returns: numpy's, torch's, or arrays of one."""
+    """
+    A schedule of Python's numbers, whatever its function returns: numpy's, torch's, or arrays of one.
+
+    :param value: a number, a function of the progress that remains, or the text of one, see :mod:`sb3_gac.schedules`
+    """
+
+    def __init__(self, value: Any):
+        super().__init__(as_schedule(value))
 
     def __call__(self, progress_remaining: float) -> float:
         """

@@ -10,6 +10,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_gac.schedules import read_schedule
+
 
 class UnsupportedActionSpaceError(AssertionError, ValueError):
     """The algorithm can't act in this action space. SB3 raises AssertionError here, so this is one as well."""
@@ -151,6 +153,11 @@ def check_schedule(name: str, value: Any, remedy: str = "or a schedule", may_be_
     """
     :raises ValueError: unless ``value`` is a number > 0, or >= 0, or a schedule, which may begin or end at zero
     """
+    if isinstance(value, str):
+        try:
+            value = read_schedule(value)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
     if not callable(value):
         (check_not_negative if may_be_zero else check_positive)(name, value, remedy)
         return

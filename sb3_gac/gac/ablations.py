@@ -27,6 +27,11 @@ class GACShare(GAC):
 class GACWithoutQ(GACShare):
     """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14, whatever ``learner_kl_scale``)."""
 
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if self.is_guided:
+            raise ValueError("guidance would do nothing: this learner climbs no critics beside which the KL could weigh.")
+
     def _learner_can_train_a_std(self) -> bool:
         return False
 

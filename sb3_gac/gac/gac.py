@@ -21,6 +21,7 @@ from sb3_gac.gac.policies import SHARED_STDS, ActionDistributions, GACGruPolicy,
 from sb3_gac.math.distributions import KL_REDUCTIONS
 from sb3_gac.math.losses import masked_mean, masked_quantile, policy_loss
 from sb3_gac.optim.coefficients import Coefficient, make_coefficient
+from sb3_gac.schedules import as_schedule
 
 KL_COEF_START = 1.0
 
@@ -34,7 +35,8 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
 
     All arguments that are not described here are those of :class:`AsymmetricOffPolicyAlgorithm`, most of them SAC's.
 
-    :param target_kl: bound on KL(guider || learner), reduced as ``kl_reduction`` says; a number or a schedule
+    :param target_kl: bound on KL(guider || learner), reduced as ``kl_reduction`` says; a number or a schedule, which may be
+        text, see :mod:`sb3_gac.schedules`
     :param kl_coef: weight alpha of the KL: "auto" (learned, eq. 17), "auto_<start value>" or a number
     :param kl_coef_bounds: smallest and largest value of a learned ``kl_coef``
     :param kl_coef_learning_rate: of a learned ``kl_coef``
@@ -46,6 +48,9 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
         is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
         learner: a pull towards it closes no gap, and the learner chases what moves along with it
+    :param guidance: weight of the KL in the learner's objective apart from ``kl_coef``, in units of the mean |Q| that it
+        climbs, as TD3+BC weighs imitation; a number or a schedule. It pulls the learner where the guider is far, and
+        ``kl_coef`` therefore small, as hard as where it is near
     :param learner_entropy: SAC's entropy term in the learner's objective and critics; False for eqs. 15 and 16 as printed,
         where nothing but the KL keeps the learner's mean from growing
     """
@@ -64,6 +69,7 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
         "max_kl": unless(None, check_positive, remedy="or None for no hard bound"),
         "shared_std": partial(check_choice, choices=("auto", *SHARED_STDS)),
         "learner_kl_scale": unless("auto", check_not_negative, remedy='or "auto"'),
+        "guidance": partial(check_schedule, may_be_zero=True),
         "learner_entropy": check_switch,
     }
     renamed_arguments: ClassVar[Mapping[str, str]] = {"std_of": "shared_std"}
@@ -71,6 +77,7 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
         *AsymmetricOffPolicyAlgorithm.compiled_settings,
         "kl_reduction",
         "learner_kl_weight",
+        "is_guided",
         "learner_entropy",
         "target_entropy",
     )
@@ -89,7 +96,7 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
         policy: str | type[GACPolicy],
         env: GymEnv | str | None,
         *sb3: Any,
-        target_kl: float | Schedule = 0.0033,
+        target_kl: float | str | Schedule = 0.0033,
         kl_coef: str | float = "auto",
         kl_coef_bounds: tuple[float, float] = (1e-4, 100.0),
         kl_coef_learning_rate: float = 3e-3,
@@ -98,6 +105,7 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
         max_kl: float | None = None,
         shared_std: str = "auto",
         learner_kl_scale: str | float = "auto",
+        guidance: float | str | Schedule = 0.0,
         learner_entropy: bool = True,
         **shared: Unpack[OffPolicyArguments],
     ):
@@ -110,6 +118,7 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
         self.max_kl = max_kl
         self.shared_std = shared_std
         self.learner_kl_scale = learner_kl_scale
+        self.guidance = guidance
         self.learner_entropy = learner_entropy
         super().__init__(policy, env, *sb3, **shared)
 
@@ -140,7 +149,8 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The entropy temperature, and the weight of the KL."""
         self.target_kl_schedule = PlainSchedule(self.target_kl)
-        self.target_kl_tensor = th.zeros((), device=self.device)
+        self.guidance_schedule = PlainSchedule(self.guidance)
+        self.target_kl_tensor, self.guidance_tensor = (th.zeros((), device=self.device) for _ in range(2))
         kl_coef = make_coefficient(
             "kl_coef", self.kl_coef, KL_COEF_START, self.kl_coef_bounds, self.kl_coef_learning_rate, self.device
         )
@@ -230,8 +240,13 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
         :return: scalar
         """
         q, log_prob = now.learner.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
-        kl = now.guider.detach().kl_of_means(now.learner, self.kl_reduction) if self.learner_kl_weight else 0.0
-        weight, ent_coef = self.learner_kl_weight * alpha, beta * self.learner_entropy
+        ent_coef = beta * self.learner_entropy
+        if not (self.learner_kl_weight or self.is_guided):
+            return policy_loss(q=q, log_prob=log_prob, ent_coef=ent_coef, mask=batch.mask)
+        kl = now.guider.detach().kl_of_means(now.learner, self.kl_reduction)
+        weight = self.learner_kl_weight * alpha
+        if self.is_guided:
+            weight = weight + self.guidance_tensor * masked_mean(q.detach().amin(dim=0).abs(), batch.mask)
         return policy_loss(q=q, log_prob=log_prob, ent_coef=ent_coef, kl=kl, kl_coef=weight, mask=batch.mask)
 
     # --- coefficients -----------------------------------------------------------------------------------------------
@@ -246,12 +261,18 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
         """Weight of the KL in the learner's objective, as a multiple of ``kl_coef``."""
         return self._auto_learner_kl_weight() if self.learner_kl_scale == "auto" else float(self.learner_kl_scale)
 
+    @property
+    def is_guided(self) -> bool:
+        """Whether ``guidance`` is anything but 0 throughout."""
+        return callable(as_schedule(self.guidance)) or float(self.guidance) != 0  # type: ignore[arg-type]
+
     def _auto_learner_kl_weight(self) -> float:
         return 0.0 if self.guider == "residual" else 1.0
 
     def refresh_schedules(self) -> None:
         super().refresh_schedules()
         self.target_kl_tensor.fill_(self.current_target_kl)
+        self.guidance_tensor.fill_(self.guidance_schedule(self._current_progress_remaining))
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "target_kl_tensor"]
+        return [*super()._excluded_save_params(), "target_kl_tensor", "guidance_tensor"]

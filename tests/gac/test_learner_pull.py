@@ -79,3 +79,22 @@ def test_without_q_the_learner_imitates_and_nothing_else():
     now = ActionDistributions(guider, learner, learner)
     loss = model.learner_objective(batch_of({}), now, th.randn(2, 1), th.tensor(1.0), th.tensor(1.0))
     assert loss.item() == pytest.approx(0.5 * (0.4**2 + 0.8**2) / 2)
+
+
+def test_guidance_follows_its_schedule_and_stands_in_a_saved_model_as_it_was_given(tmp_path):
+    model = small_model(guidance="linear 0.4 -> 0.0 over 0.5")
+    assert model.is_guided
+    for remaining, now in ((1.0, 0.4), (0.75, 0.2), (0.5, 0.0), (0.0, 0.0)):
+        model._current_progress_remaining = remaining
+        model.refresh_schedules()
+        assert model.guidance_tensor.item() == pytest.approx(now)
+    model.save(tmp_path / "model")
+    loaded = GAC.load(tmp_path / "model")
+    assert loaded.guidance == "linear 0.4 -> 0.0 over 0.5"
+    assert loaded.guidance_schedule(0.75) == pytest.approx(0.2)
+
+
+def test_a_learner_without_critics_refuses_guidance():
+    with pytest.raises(ValueError, match="guidance would do nothing"):
+        small_model(cls=GACWithoutQ, guidance=0.1)
+    assert not small_model(cls=GACWithoutQ, guidance=0.0).is_guided

@@ -93,6 +93,7 @@ class Settings:
 
     :param shared_std: whose std guider and learner have
     :param pull: weight of the KL in the learner's objective, as a multiple of alpha
+    :param guidance: what is added to that weight, as a multiple of the mean |Q| that the learner climbs
     :param critic_groups: of SAC, each with a minimum of its own
     :param rates: network -> learning rate, where it is not ``learning_rate``
     """
@@ -112,6 +113,7 @@ class Settings:
     max_kl: float | None = None
     shared_std: str = "learner"
     pull: float = 0.0
+    guidance: float = 0.0
     learner_entropy: bool = True
     critic_groups: int = 1
     teacher_coef: str | float = 1.0
@@ -312,7 +314,8 @@ class PlainGAC(PlainAlgorithm):
         """Eq. 16; of GACShare phi is theta."""
         q, log_prob = pi.value_and_log_prob(self.q(self.phi, batch), noise)
         kl = mu.kl(pi, self.settings.kl_reduction)
-        return batch.mean(self.settings.pull * alpha * kl + beta * log_prob - q)
+        weight = self.settings.pull * alpha + self.settings.guidance * batch.mean(q.abs()).detach()
+        return batch.mean(weight * kl + beta * log_prob - q)
 
     def fit_of_the_std(self, batch: Batch, guider_outputs: dict[str, th.Tensor]) -> tuple[Any, list[nn.Parameter]]:
         """Where the guider has the std: the learner's own, for deployment, is fitted to it; nothing but its layer moves."""
