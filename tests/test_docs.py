@@ -70,7 +70,7 @@ def test_what_a_user_types_runs(beside_the_file, monkeypatch):
 
 def test_what_is_shown_of_the_packages_files_is_there():
     shown = {path: parts for path, parts in _named().items() if "/" in path}
-    assert {Path(path).stem for path in shown} == {"tgrl", "cosil"}
+    assert {Path(path).stem for path in shown} == {"tgrl", "cosil", "comparing"}
     assert sum(map(len, shown.values())) >= 12
     for path, parts in shown.items():
         source = (ROOT / path).read_text()

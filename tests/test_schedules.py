@@ -75,7 +75,7 @@ def test_arguments_that_take_schedules_take_their_text():
     model._current_progress_remaining = 0.75
     assert model.current_target_kl == pytest.approx(0.04)
     assert model.lr_schedule(0.5) == pytest.approx(5e-4)
-    assert model.chooses_behaviour._shares_now(0.5) == {"learner": 0.25}
+    assert model.chooses_behaviour.shares_at(0.5) == {"learner": 0.25}
 
 
 def test_a_negative_end_is_refused():

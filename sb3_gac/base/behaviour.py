@@ -32,9 +32,25 @@ class Behaviour:
         self.per = per
         for role in (self.default, *self.shares):
             check_choice("behaviour: a policy", role, (*roles.policies, *frozen))
-        self._shares_now(1.0)
+        self.shares_at(1.0)
 
-    def _shares_now(self, progress_remaining: float) -> dict[str, float]:
+    def acts(self, role: str) -> bool:
+        """
+        :param role: a policy
+        :return: whether it has a share at some time of training, of which nine are looked at
+        """
+        return any(self._share_of(role, eighths / 8) > 0 for eighths in range(9))
+
+    def _share_of(self, role: str, progress_remaining: float) -> float:
+        shares = self.shares_at(progress_remaining)
+        return shares.get(role, 0.0) + (1.0 - sum(shares.values()) if role == self.default else 0.0)
+
+    def shares_at(self, progress_remaining: float) -> dict[str, float]:
+        """
+        :param progress_remaining: from 1 to 0
+        :return: share of each policy that has one by name
+        :raises ValueError: if these are no shares
+        """
         now = {role: float(share(progress_remaining) if callable(share) else share) for role, share in self.shares.items()}
         if not (all(0 <= share <= 1 for share in now.values()) and sum(now.values()) <= 1 + 1e-9):
             raise ValueError(f"behaviour must be shares from 0 to 1 that sum up to 1 at most, got {now}.")
@@ -49,7 +65,7 @@ class Behaviour:
         """
         if not self.shares or not episode_start.any():
             return list(acting) if self.shares else [self.default] * len(episode_start)
-        shares = self._shares_now(progress_remaining)
+        shares = self.shares_at(progress_remaining)
         names, limits = list(shares), np.cumsum(list(shares.values()))
         n_envs = len(episode_start)
         drawn = np.random.rand(n_envs) if self.per == "episode" else (np.arange(n_envs) + 0.5) / n_envs

@@ -14,6 +14,7 @@ from typing_extensions import Unpack
 
 from sb3_gac.base.arguments import OffPolicyArguments
 from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
+from sb3_gac.base.comparing import ReturnComparison
 from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles
@@ -61,7 +62,7 @@ class TGRLLstmPolicy(TGRLPolicy):
     default_rnn_type = "lstm"
 
 
-class TGRL(AsymmetricOffPolicyAlgorithm):
+class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[override]
     """
     A main actor earns reward and stays near a teacher that sees everything, an auxiliary one earns reward alone; the weight of
     the teacher rises while the main actor's episodes are the better ones (Shenfeld et al. 2023, arXiv 2307.03186).
@@ -105,9 +106,8 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
         **shared: Unpack[OffPolicyArguments],
     ):
         self.teacher = teacher
-        self.teacher_coef, self.coef_step, self.compare_every, self.window = teacher_coef, coef_step, compare_every, window
-        self.returns: dict[str, list[float]] = {"actor": [], "auxiliary": []}
-        self.next_comparison = compare_every
+        self.teacher_coef, self.coef_step = teacher_coef, coef_step
+        self.start_comparing("actor", "auxiliary", compare_every, window)
         super().__init__(policy, env, *sb3, **shared)
 
     def make_coefficients(self) -> dict[str, Coefficient]:
@@ -118,7 +118,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
     # --- algorithm ----------------------------------------------------------------------------------------------------
 
     def update(self, batch: Batch) -> Metrics:
-        """Both critics, then both actors; the teacher's weight follows from episodes, see :meth:`on_step`."""
+        """Both critics, then both actors; the teacher's weight follows from episodes, see :meth:`compare`."""
         beta, c = self.coefficients["ent_coef"].value, self.coefficients["teacher_coef"].value
         noise = th.randn((4, *batch.actions.shape), device=self.device)
         actor, auxiliary = self.outputs(batch, "actor", "auxiliary")
@@ -171,21 +171,7 @@ class TGRL(AsymmetricOffPolicyAlgorithm):
         other = {"actor": "auxiliary", "auxiliary": "actor"}
         return [other[role] if starts else role for role, starts in zip(self.acting, episode_start, strict=True)]
 
-    def on_episode_end(self, env: int, episode_return: float, role: str | None) -> None:
-        """See :meth:`EpisodeHooks.on_episode_end`."""
-        if role in self.returns:  # neither the warm-up nor the teacher
-            self.returns[role] = [*self.returns[role], episode_return][-self.window :]
-
-    def on_step(self) -> None:
+    def compare(self, difference: float) -> None:
         """The teacher's weight takes a step: up where the main actor's latest episodes were the better ones."""
-        if self.num_timesteps < self.next_comparison:
-            return
-        self.next_comparison = self.num_timesteps - self.num_timesteps % self.compare_every + self.compare_every
-        if all(self.returns.values()):
-            main, auxiliary = (float(np.mean(self.returns[role])) for role in ("actor", "auxiliary"))
-            self.coefficients["teacher_coef"].move(np.sign(main - auxiliary))  # type: ignore[union-attr]
-            self.logger.record("rollout/main_minus_auxiliary", main - auxiliary)
-
-    def training_state(self) -> dict[str, Any]:
-        """See :meth:`ResumableAlgorithm.training_state`."""
-        return {"returns": self.returns, "next_comparison": self.next_comparison}
+        self.coefficients["teacher_coef"].move(np.sign(difference))  # type: ignore[union-attr]
+        self.logger.record("rollout/main_minus_auxiliary", difference)

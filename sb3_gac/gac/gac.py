@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
@@ -12,6 +13,7 @@ from typing_extensions import Unpack
 
 from sb3_gac.base.arguments import OffPolicyArguments
 from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
+from sb3_gac.base.comparing import ReturnComparison
 from sb3_gac.base.guider import GuiderPrediction
 from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.checks.arguments import ArgumentCheck, PlainSchedule, check_switch, unless
@@ -24,9 +26,13 @@ from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.schedules import as_schedule
 
 KL_COEF_START = 1.0
+#: Of target_kl="auto": its start, its bounds, and what it is multiplied with or divided by at a comparison
+AUTO_TARGET_KL, AUTO_TARGET_KL_BOUNDS, AUTO_TARGET_KL_FACTOR = 0.0033, (1e-4, 0.05), 1.1
+#: Environment steps between two comparisons of the policies' returns, and episodes of each that are compared
+COMPARE_EVERY, COMPARED_EPISODES = 1_000, 20
 
 
-class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[override]
+class GAC(ReturnComparison, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[override]
     """
     Guided Actor-Critic: a guider that sees everything collects the data, a learner that sees ``partial`` alone is
     pulled towards it by a KL constraint and by critics of its own. ``predict`` is the learner.
@@ -36,7 +42,8 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
     All arguments that are not described here are those of :class:`AsymmetricOffPolicyAlgorithm`, most of them SAC's.
 
     :param target_kl: bound on KL(guider || learner), reduced as ``kl_reduction`` says; a number or a schedule, which may be
-        text, see :mod:`sb3_gac.schedules`
+        text, see :mod:`sb3_gac.schedules`; or "auto": it follows from episodes of both policies, see :meth:`compare`, and
+        ``behaviour`` must give the learner a share of them
     :param kl_coef: weight alpha of the KL: "auto" (learned, eq. 17), "auto_<start value>" or a number
     :param kl_coef_bounds: smallest and largest value of a learned ``kl_coef``
     :param kl_coef_learning_rate: of a learned ``kl_coef``
@@ -62,7 +69,7 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
     }
 
     argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {
-        "target_kl": partial(check_schedule, remedy="for example the default 0.0033, or a schedule of such"),
+        "target_kl": unless("auto", check_schedule, remedy='for example the default 0.0033, a schedule of such, or "auto"'),
         "kl_coef_learning_rate": check_positive,
         "kl_reduction": partial(check_choice, choices=KL_REDUCTIONS),
         "guider": partial(check_choice, choices=GUIDERS),
@@ -119,6 +126,8 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
         self.shared_std = shared_std
         self.learner_kl_scale = learner_kl_scale
         self.guidance = guidance
+        self.auto_target_kl = AUTO_TARGET_KL
+        self.start_comparing("guider", "learner", COMPARE_EVERY, COMPARED_EPISODES)
         self.learner_entropy = learner_entropy
         super().__init__(policy, env, *sb3, **shared)
 
@@ -130,6 +139,11 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
             raise ValueError(
                 'shared_std="learner" needs an entropy term in the learner\'s objective, or nothing keeps its std from '
                 'falling: leave shared_std "auto", or give GAC or GACShare learner_entropy=True.'
+            )
+        if self.target_kl == "auto" and not all(map(self._make_behaviour().acts, self.returns)):
+            raise ValueError(
+                'target_kl="auto" compares episodes of guider and learner, of which one never acts: give each a share, as in '
+                'behaviour={"learner": 0.25}, or give a number for target_kl.'
             )
         if self.max_kl is not None and not isinstance(self.action_space, spaces.Box):
             raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
@@ -148,7 +162,7 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
 
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The entropy temperature, and the weight of the KL."""
-        self.target_kl_schedule = PlainSchedule(self.target_kl)
+        self.target_kl_schedule = PlainSchedule(AUTO_TARGET_KL if self.target_kl == "auto" else self.target_kl)
         self.guidance_schedule = PlainSchedule(self.guidance)
         self.target_kl_tensor, self.guidance_tensor = (th.zeros((), device=self.device) for _ in range(2))
         kl_coef = make_coefficient(
@@ -254,7 +268,23 @@ class GAC(GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[overr
     @property
     def current_target_kl(self) -> float:
         """The bound on KL at this point of training."""
-        return self.target_kl_schedule(self._current_progress_remaining)
+        return self.auto_target_kl if self.target_kl == "auto" else self.target_kl_schedule(self._current_progress_remaining)
+
+    def compare(self, difference: float) -> None:
+        """
+        With ``target_kl="auto"``, the guider may go further while its episodes return more than the learner's own, and must
+        come nearer when they do not, as Teacher-Guided RL moves its teacher's weight.
+
+        :param difference: mean return of the guider's latest episodes, less that of the learner's own
+        """
+        self.logger.record("rollout/guider_minus_learner", difference)
+        low, high = AUTO_TARGET_KL_BOUNDS
+        moved = self.auto_target_kl * AUTO_TARGET_KL_FACTOR ** float(np.sign(difference))
+        self.auto_target_kl = min(max(moved, low), high)
+
+    def training_state(self) -> dict[str, Any]:
+        """See :meth:`ResumableAlgorithm.training_state`."""
+        return super().training_state() | {"auto_target_kl": self.auto_target_kl}
 
     @property
     def learner_kl_weight(self) -> float:
