@@ -48,6 +48,7 @@ def _normalised(action_space=None):
 
 KINDS = {
     "mlp": lambda: small_model(Sampled(VECTORS)),
+    "mlp, lagged": lambda: small_model(Sampled(VECTORS), guider="lagged"),
     "mlp, two networks": lambda: small_model(Sampled(VECTORS), guider="independent"),
     "mlp, shared encoder": lambda: small_model(Sampled(VECTORS), policy_kwargs=SHARED),
     "mlp, normalised": lambda: small_model(_normalised()),

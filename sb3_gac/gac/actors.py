@@ -1,6 +1,6 @@
-"""The two policies: a learner on its own entries, and a guider relative to it or independent of it."""
+"""The two policies: a learner on its own entries, and a guider relative to it, to its average, or independent of it."""
 
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -69,6 +69,9 @@ class Guider(RolePolicy):
     :param kl_reduction: how the bounded KL is reduced over action dimensions
     """
 
+    #: Whether it needs a target of the learner
+    needs_target: ClassVar[bool] = False
+
     def __init__(self, *args: Any, max_kl: float | None = None, kl_reduction: str = "mean", **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.max_kl = max_kl
@@ -115,4 +118,51 @@ class ResidualGuider(Guider):
         return learner.with_residual(self._bounded(output))
 
 
-GUIDERS: dict[str, type[Guider]] = {"residual": ResidualGuider, "independent": Guider}
+class LaggedOutput(NamedTuple):
+    """
+    What a lagged guider's networks compute.
+
+    :param base: the lagged learner's distribution, a constant, shapes (\\*E, A)
+    :param correction: delta, shapes (\\*E, A)
+    """
+
+    base: Any
+    correction: Any
+
+    def detach(self) -> "LaggedOutput":
+        """The same as a constant."""
+        return LaggedOutput(self.base, self.correction.detach())
+
+    def with_std_of(self, lender: Any) -> "LaggedOutput":
+        """See :meth:`TanhGaussian.with_std_of`."""
+        return LaggedOutput(self.base, self.correction.with_std_of(lender))
+
+
+class LaggedGuider(ResidualGuider):
+    """
+    The guider as the learner's Polyak average plus a privileged correction, m_mu = m_pi_bar + std delta: the learner can
+    absorb the correction, and the KL, which tells how far it has, depends on the learner.
+    """
+
+    needs_target = True
+    _followed: tuple[Learner] | None = None
+
+    def follow(self, learner: Learner) -> None:
+        """
+        :param learner: the average, which is no part of this network
+        """
+        self._followed = (learner,)
+
+    def distribution(self, obs: PyTorchObs) -> Any:
+        """See :meth:`RolePolicy.distribution`."""
+        assert self._followed is not None
+        with th.no_grad():
+            base = self._followed[0].distribution(obs)
+        return LaggedOutput(base, super().distribution(obs))
+
+    def relative_to(self, learner: Any, output: LaggedOutput) -> Distribution:
+        """See :meth:`Guider.relative_to`."""
+        return Guider.relative_to(self, learner, output.base.with_residual(output.correction))
+
+
+GUIDERS: dict[str, type[Guider]] = {"residual": ResidualGuider, "lagged": LaggedGuider, "independent": Guider}

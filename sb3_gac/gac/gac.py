@@ -48,13 +48,14 @@ class GAC(ReturnComparison, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # 
     :param kl_coef_bounds: smallest and largest value of a learned ``kl_coef``
     :param kl_coef_learning_rate: of a learned ``kl_coef``
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
-    :param guider: "residual": learner plus a privileged correction; "independent": a network of its own (the paper's)
+    :param guider: "residual": learner plus a privileged correction; "lagged": the learner's Polyak average plus one;
+        "independent": a network of its own (the paper's)
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
     :param shared_std: whose standard deviation both policies have, "learner" or "guider"; the other borrows it as a constant.
-        "auto" is the guider's, the paper's, unless the guider is residual and the learner has an entropy term
-    :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto"
-        is 1, the paper's, with an independent guider and 0 with a residual one, whose KL does not depend on the
-        learner: a pull towards it closes no gap, and the learner chases what moves along with it
+        "auto" is the guider's, the paper's, unless the guider is relative to the learner and that has an entropy term
+    :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto" is 1,
+        the paper's, and 0 with a residual guider, whose KL does not depend on the learner: a pull towards it closes no gap,
+        and the learner chases what moves along with it
     :param guidance: weight of the KL in the learner's objective apart from ``kl_coef``, in units of the mean |Q| that it
         climbs, as TD3+BC weighs imitation; a number or a schedule. It pulls the learner where the guider is far, and
         ``kl_coef`` therefore small, as hard as where it is near
@@ -152,7 +153,7 @@ class GAC(ReturnComparison, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # 
         return self.learner_entropy
 
     def _policy_options(self) -> dict[str, Any]:
-        own = self.guider == "residual" and self._learner_can_train_a_std()
+        own = self.guider != "independent" and self._learner_can_train_a_std()
         return super()._policy_options() | {
             "guider": self.guider,
             "max_kl": self.max_kl,

@@ -9,7 +9,7 @@ from torch import nn
 
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles
-from sb3_gac.gac.actors import GUIDERS, Guider, Learner, LearnerAsActor
+from sb3_gac.gac.actors import GUIDERS, Guider, LaggedGuider, Learner, LearnerAsActor
 from sb3_gac.math.distributions import Distribution
 from sb3_gac.networks.actors import RolePolicy
 from sb3_gac.networks.critics import CriticEnsemble
@@ -39,7 +39,7 @@ class GACPolicy(AsymmetricPolicy):
     Arguments that are not described here are those of :class:`AsymmetricPolicy`.
 
     :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}`` or ``{"guider", "learner", "critic"}``
-    :param guider: "residual" or "independent", a key of ``GUIDERS``
+    :param guider: "residual", "lagged" or "independent", a key of ``GUIDERS``
     :param max_kl: hard bound on KL(guider || learner), or ``None``
     :param kl_reduction: how that KL is reduced over action dimensions, "mean" or "sum"
     :param learner_critics: whether the learner has critics of its own
@@ -53,6 +53,7 @@ class GACPolicy(AsymmetricPolicy):
     renamed_arguments: ClassVar[Mapping[str, str]] = {"std_of": "shared_std"}
     guider: Guider
     learner: Learner
+    learner_target: Learner
     guider_critic: CriticEnsemble
     guider_critic_target: CriticEnsemble
 
@@ -73,6 +74,8 @@ class GACPolicy(AsymmetricPolicy):
         **kwargs: Any,
     ):
         self.guider_class = GUIDERS[guider]
+        if self.guider_class.needs_target:
+            self.roles = self.roles._replace(target_policies=("learner",))  # type: ignore[misc]
         self.learner_critics = learner_critics
         self.owns_std = shared_std == "learner"
         self.guider_options: dict[str, Any] = {"max_kl": max_kl, "kl_reduction": kl_reduction}
@@ -88,6 +91,16 @@ class GACPolicy(AsymmetricPolicy):
         if role == "learner":
             return Learner(**arguments, owns_std=self.owns_std)
         return self.guider_class(**arguments, **self.guider_options)
+
+    def tie_networks(self) -> None:
+        """See :meth:`AsymmetricPolicy.tie_networks`."""
+        if isinstance(self.guider, LaggedGuider):
+            if self.remembers:
+                raise ValueError(
+                    'guider="lagged" asks an average of the learner, whose memory nobody carries along: use "residual" where '
+                    "policies remember."
+                )
+            self.guider.follow(self.learner_target)
 
     def has(self, role: str) -> bool:
         """See :meth:`AsymmetricPolicy.has`."""

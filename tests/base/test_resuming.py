@@ -52,6 +52,7 @@ CASES = {  # name -> environment, algorithm and arguments
     "action noise": (_bandits, GAC, {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(1), np.ones(1))}),
     "by episode": (_bandits, GAC, {"train_freq": (1, "episode"), "gradient_steps": -1}),
     "independent": (_bandits, GAC, {"guider": "independent"}),
+    "lagged": (_bandits, GAC, {"guider": "lagged", "guidance": "linear 0.3 -> 0.0"}),
     "share": (_bandits, GACShare, {}),
     "asymmetric SAC": (lambda: _bandits(3), AsymmetricSAC, {"gradient_steps": 2}),
     "asymmetric MPO": (_hopper, AsymmetricMPO, {"n_actions": 4}),

@@ -12,7 +12,7 @@ from tests.gac.helpers import batch_of
 from tests.helpers import small_model
 
 
-@pytest.mark.parametrize(("guider", "scale"), [("residual", 0.0), ("independent", 1.0)])
+@pytest.mark.parametrize(("guider", "scale"), [("residual", 0.0), ("lagged", 1.0), ("independent", 1.0)])
 def test_the_pull_towards_the_guider_is_there_where_it_can_close_a_gap(guider, scale):
     assert small_model(guider=guider).learner_kl_weight == scale
     assert small_model(guider=guider, learner_kl_scale=0.3).learner_kl_weight == 0.3
@@ -98,3 +98,24 @@ def test_a_learner_without_critics_refuses_guidance():
     with pytest.raises(ValueError, match="guidance would do nothing"):
         small_model(cls=GACWithoutQ, guidance=0.1)
     assert not small_model(cls=GACWithoutQ, guidance=0.0).is_guided
+
+
+def test_a_lagged_guider_stands_at_the_learners_average_whatever_the_learner_is_by_now():
+    """Where the residual one moves along; its KL tells how far the learner has absorbed the correction."""
+    model = small_model(guider="lagged")
+    obs = {"partial": th.randn(32, 2), "privileged": th.randn(32, 1)}
+    with th.no_grad():
+        before = model.policy.distributions(obs)
+        model.policy.learner.head.mean.bias.add_(0.3)
+        after = model.policy.distributions(obs)
+        th.testing.assert_close(after.guider.mean, before.guider.mean)
+        assert before.guider.kl_of_means(before.learner).max() < 1e-3
+        shifted = 0.5 * (0.3 / after.learner.log_std.exp()).square().mean(-1)
+        th.testing.assert_close(after.guider.kl_of_means(after.learner), shifted, rtol=0.05, atol=1e-3)
+        model.policy.update_targets(1.0)
+        assert model.policy.distributions(obs).guider.kl_of_means(after.learner).max() < 1e-3, "the average has followed"
+
+
+def test_a_lagged_guider_refuses_memories():
+    with pytest.raises(ValueError, match='guider="lagged" asks an average of the learner'):
+        small_model(policy="MultiInputGruPolicy", guider="lagged", policy_kwargs={"rnn_hidden_size": 4, "rnn_net_arch": [4]})

@@ -77,6 +77,7 @@ def test_each_phase_is_a_program_of_its_own():
 
 IMAGES = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=spaces.Box(-1, 1, (2,), np.float32))
 KINDS = {
+    "lagged, guided": lambda **arguments: _filled(GAC, guider="lagged", guidance="linear 0.5 -> 0.0", **arguments),
     "discrete": lambda **arguments: _filled(GAC, env=TwoViewChoice(), **arguments),
     "images, AdamW": lambda **arguments: _filled(
         AsymmetricSAC,

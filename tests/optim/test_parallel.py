@@ -33,7 +33,7 @@ def _trained(threads, **arguments):
     return model
 
 
-@pytest.mark.parametrize("guider", ["residual", "independent"])
+@pytest.mark.parametrize("guider", ["residual", "lagged", "independent"])
 def test_training_is_the_same_to_the_bit(two_threads, guider):
     in_turn, at_once = (_trained(threads, guider=guider) for threads in (1, 2))
     for (name, p), q in zip(in_turn.policy.named_parameters(), at_once.policy.parameters(), strict=True):

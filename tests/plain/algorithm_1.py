@@ -249,15 +249,20 @@ class PlainGAC(PlainAlgorithm):
         self.theta, self.theta_bar = self.networks["guider_critic"], self.targets["guider_critic_target"]
         self.phi = self.networks.get("learner_critic", self.theta)
         self.phi_bar = self.targets.get("learner_critic_target")
+        if settings.guider == "lagged":
+            self.targets["learner_target"] = self.copied(policy, "learner_target")
 
     def policies(self, guider_outputs: dict[str, th.Tensor], learner_outputs: dict[str, th.Tensor]) -> tuple[Any, Any]:
         """mu and pi."""
         settings = self.settings
         mu, pi = self.distribution(guider_outputs), self.distribution(learner_outputs)
         if isinstance(mu, Choice) or isinstance(pi, Choice):
-            return (Choice(pi.logits.detach() + mu.logits), pi) if settings.guider == "residual" else (mu, pi)
+            base = {"residual": pi.logits.detach(), "lagged": guider_outputs.get("base")}.get(settings.guider, 0.0)
+            return Choice(base + mu.logits), pi
         std = pi.std if settings.shared_std == "learner" else mu.std
         delta = mu.mean if settings.guider == "residual" else (mu.mean - pi.mean.detach()) / std.detach()
+        if settings.guider == "lagged":
+            delta = mu.mean + (guider_outputs["base"] - pi.mean.detach()) / std.detach()
         if settings.max_kl is not None:  # KL = sum or mean of delta^2 / 2
             dimensions = delta.shape[-1] if settings.kl_reduction == "mean" else 1
             delta = delta * ((2 * settings.max_kl * dimensions) ** 0.5 / delta.norm(dim=-1, keepdim=True)).clamp(max=1)
@@ -277,6 +282,9 @@ class PlainGAC(PlainAlgorithm):
         alpha, beta = self.alpha.value, self.beta.value
         beta_of_learner = beta if settings.learner_entropy else 0.0
         guider_outputs, learner_outputs = (self.outputs(self.networks[name], batch) for name in ("guider", "learner"))
+        if settings.guider == "lagged":
+            for outputs, base in zip(guider_outputs, self.outputs(self.targets["learner_target"], batch), strict=True):
+                outputs["base"] = base["logits" if self.discrete else "mean"].detach()
         mu, pi = self.policies(guider_outputs[0], learner_outputs[0])
         future = batch.discounts * (1 - batch.terminated)
         with th.no_grad():
