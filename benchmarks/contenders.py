@@ -31,7 +31,10 @@ def timer(step: Callable[[], Any], clock: Callable[[], float] = time.perf_counte
 
 @contextmanager
 def process_timers(
-    make: Callable[..., Callable[[], Any]], arguments: dict[str, tuple], threads: int
+    make: Callable[..., Callable[[], Any]],
+    arguments: dict[str, tuple],
+    threads: int,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[dict[str, Timer]]:
     """
     Contenders in processes of their own: the threads of one, which wait busily for more work, take no time from another.
@@ -39,6 +42,7 @@ def process_timers(
     :param make: of a module, makes a step from arguments
     :param arguments: name -> arguments
     :param threads: torch's, in each process
+    :param clock: see :func:`timer`
     :return: name -> timer, for as long as the context lasts
     """
     context = multiprocessing.get_context("spawn")
@@ -46,7 +50,7 @@ def process_timers(
     processes = []
     for name, values in arguments.items():
         connections[name], theirs = context.Pipe()
-        processes.append(context.Process(target=_serve, args=(theirs, make, values, threads), daemon=True))
+        processes.append(context.Process(target=_serve, args=(theirs, make, values, threads, clock), daemon=True))
         processes[-1].start()
         theirs.close()
 
@@ -68,9 +72,15 @@ def process_timers(
             process.join()  # what is timed next has the machine to itself
 
 
-def _serve(connection: Connection, make: Callable[..., Callable[[], Any]], arguments: tuple, threads: int) -> None:
+def _serve(
+    connection: Connection,
+    make: Callable[..., Callable[[], Any]],
+    arguments: tuple,
+    threads: int,
+    clock: Callable[[], float],
+) -> None:
     th.set_num_threads(threads)
-    seconds = timer(make(*arguments))
+    seconds = timer(make(*arguments), clock)
     connection.send("ready")
     try:
         while True:

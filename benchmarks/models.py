@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import Logger
 
 import sb3_gac
 from benchmarks.contenders import alternate, timer
+from sb3_gac.checks.arguments import constructor_parameters
 
 SIZES = {"HalfCheetah": (8, 17, 6), "Ant": (13, 27, 8), "Humanoid": (169, 270, 17)}
 COMPILED, MIXED = {"compile": True}, {"compile": True, "mixed_precision": True}
@@ -23,6 +24,20 @@ CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {  # name -> class and argum
     "gac-mixed": (sb3_gac.GAC, MIXED),
     "sac-asym": (sb3_gac.AsymmetricSAC, {}),
     "sac-asym-compiled": (sb3_gac.AsymmetricSAC, COMPILED),
+}
+PAIRS = {"critic_groups": 2, "policy_kwargs": {"n_critics": 4}}
+BASELINES: dict[str, tuple[Any, dict[str, Any]]] = {  # the same of the other algorithms
+    "sac": CONTENDERS["sac"],
+    "gac": CONTENDERS["gac"],
+    "gac-share": (sb3_gac.GACShare, {}),
+    "sac-asym": CONTENDERS["sac-asym"],
+    "sac-asym-four-critics": (sb3_gac.AsymmetricSAC, PAIRS),
+    "tgrl": (sb3_gac.TGRL, {}),
+    "cosil": (sb3_gac.COSIL, {}),
+    "rma": (sb3_gac.RMA, {}),
+    "mpo-asym": (sb3_gac.AsymmetricMPO, {}),
+    "gpo-clip": (sb3_gac.GPOClip, {}),
+    "gpo-penalty": (sb3_gac.GPOPenalty, {}),
 }
 if importlib.util.find_spec("sbx"):
     import sbx  # type: ignore[import-not-found]
@@ -91,6 +106,33 @@ def make_step(contender: str, sizes: tuple[int, int, int], batch: int, width: in
     """
     model = make_model(contender, sizes, batch, width)
     return lambda: model.train(1, batch)
+
+
+def make_baseline_step(name: str, sizes: tuple[int, int, int], batch: int, width: int, compiled: bool) -> Callable[[], None]:
+    """
+    :param name: a key of ``BASELINES``
+    :param sizes: partial, privileged, actions
+    :param batch: batch size
+    :param width: of the two hidden layers
+    :param compiled: whether to compile
+    :return: one gradient step, as ``learn`` makes it; of on-policy algorithms one minibatch, which is the whole rollout
+    """
+    algorithm, arguments = BASELINES[name]
+    known = constructor_parameters(algorithm)
+    of_policy = {"net_arch": [width, width], "activation_fn": th.nn.SiLU, **arguments.get("policy_kwargs", {})}
+    settings = {"learning_starts": 10**9, "buffer_size": 4_000, "n_steps": batch, "n_epochs": 1} | arguments
+    is_on_policy = "n_epochs" in known
+    settings = {key: value for key, value in settings.items() if key in known and (key != "n_steps" or is_on_policy)}
+    settings |= {"batch_size": batch, "policy_kwargs": of_policy, "seed": 0, "device": "cpu"}
+    if compiled:
+        settings["compile"] = True
+    if "teacher" in known:
+        keys: dict[str, Any] = {"role_keys": {"actor": ["partial", "privileged"]}, "policy_kwargs": of_policy, "device": "cpu"}
+        settings["teacher"] = sb3_gac.AsymmetricSAC("MultiInputPolicy", SpacesOnly(*sizes), **keys)
+    model = algorithm("MultiInputPolicy", SpacesOnly(*sizes), **settings)
+    model.set_logger(Logger(None, []))
+    model.learn(batch if is_on_policy else 2_000)
+    return model.train if is_on_policy else lambda: model.train(1, batch)
 
 
 def step_flops(sizes: tuple[int, int, int], batch: int, width: int) -> float:

@@ -25,9 +25,11 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 import sb3_gac
 from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.models import (
+    BASELINES,
     CONTENDERS,
     SIZES,
     SpacesOnly,
+    make_baseline_step,
     make_model,
     make_recurrent_step,
     make_step,
@@ -66,6 +68,31 @@ def compare_steps(
         **{f"{name}_over_sac": round(median_ratio(seconds["sac"], seconds[name]), 3) for name in others},
         **{f"{name}_share_of_limit": round(1 / float(np.median(seconds[name])) / limit, 3) for name in guided},
     }
+
+
+def compare_baselines(
+    names: Iterable[str], sizes: tuple[int, int, int], batch: int, width: int, rounds: int
+) -> list[dict[str, Any]]:
+    """
+    With one thread, in processor time.
+
+    :return: of each contender, milliseconds of a gradient step, and its rate as a multiple of that of SB3's SAC; compiled too
+    """
+    arguments = {(name, compiled): (name, sizes, batch, width, compiled) for name in names for compiled in (False, True)}
+    del arguments["sac", True]
+    by_key = {f"{name}, {compiled}": values for (name, compiled), values in arguments.items()}
+    with process_timers(make_baseline_step, by_key, 1, time.process_time) as timers:
+        seconds = alternate(timers, BLOCK, rounds)
+    sac = seconds["sac, False"]
+    return [
+        {
+            "algorithm": name,
+            "compiled": compiled,
+            "milliseconds": round(1e3 * float(np.median(own := seconds[f"{name}, {compiled}"])), 2),
+            "over_sac": round(median_ratio(sac, own), 2),
+        }
+        for name, compiled in arguments
+    ]
 
 
 def median_ratio(numerators: list[float], denominators: list[float]) -> float:
@@ -244,6 +271,7 @@ def tabulate_recurrent(threads: list[int], quick: bool) -> list[dict[str, Any]]:
 TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name -> threads, whether to be quick -> rows
     "wrappers": lambda threads, quick: [compare_wrappers(3 if quick else 10 * ROUNDS)],
     "steps": tabulate_steps,
+    "baselines": lambda threads, quick: compare_baselines(BASELINES, SIZES["HalfCheetah"], 256, 256, 3 if quick else ROUNDS),
     "profile": lambda threads, quick: profile_step("gac-compiled", SIZES["HalfCheetah"], 256, 256, 20 if quick else 200),
     "growth": tabulate_growth,
     "recurrent": tabulate_recurrent,

@@ -11,9 +11,16 @@ import pytest
 import torch as th
 
 from benchmarks.contenders import alternate, process_timers, timer
-from benchmarks.models import LoopedGRU, recurrent_step_flops, step_flops
+from benchmarks.models import BASELINES, LoopedGRU, make_baseline_step, recurrent_step_flops, step_flops
 from benchmarks.profiles import cumulative_seconds, env_step, profile_rollout, profile_step
-from benchmarks.speed import compare_buffers, compare_checkpoints, compare_deployment, compare_recurrent, compare_steps
+from benchmarks.speed import (
+    compare_baselines,
+    compare_buffers,
+    compare_checkpoints,
+    compare_deployment,
+    compare_recurrent,
+    compare_steps,
+)
 
 
 def test_arithmetic_of_a_step_by_hand():
@@ -62,6 +69,15 @@ def test_comparisons_give_finite_figures():
     assert "sac-asym_share_of_limit" not in row, "its limit is another"
     assert 0 < row["gac_share_of_limit"] < 1
     assert compare_buffers((169, 270, 17), capacity=6_000)["bytes_over_sb3"] <= 0.52
+
+
+def test_every_baseline_takes_the_steps_that_are_timed():
+    for name in BASELINES:
+        make_baseline_step(name, (2, 3, 1), 8, 8, compiled=False)()
+    rows = compare_baselines(("sac", "mpo-asym"), (2, 3, 1), batch=8, width=8, rounds=1)
+    assert [(row["algorithm"], row["compiled"]) for row in rows] == [("sac", False), ("mpo-asym", False), ("mpo-asym", True)]
+    assert rows[0]["over_sac"] == 1
+    assert all(row["milliseconds"] > 0 < row["over_sac"] for row in rows)
 
 
 def test_a_next_checkpoint_is_a_part_of_the_first():
