@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -48,11 +49,13 @@ class Line(NamedTuple):
     :param arguments: to make it small, beside those of its family
     :param policy_kwargs: the same for its policy
     :param lacks: a key of ``OPTIONS`` -> why the method does not have it
+    :param one_phase: arguments with which all gradient steps of a training are of one kind
     """
 
     arguments: Mapping[str, Any] = NOTHING
     policy_kwargs: Mapping[str, Any] = NOTHING
     lacks: Mapping[str, str] = NOTHING
+    one_phase: Mapping[str, Any] = NOTHING
 
 
 #: What some methods do not have, and how it is asked for
@@ -87,7 +90,7 @@ LINES = {
     "asymmetric_sac": Line(),
     "asymmetric_mpo": Line({"n_actions": 4}, lacks=NO_ENTROPY),
     "cosil": Line(lacks=NO_ENTROPY),
-    "rma": Line({"history": 3}, {"encoder_net_arch": [8], "latent_dim": 3}, OF_RMA),
+    "rma": Line({"history": 3}, {"encoder_net_arch": [8], "latent_dim": 3}, OF_RMA, one_phase={"phase_1_steps": 10_000}),
     "tgrl": Line(),
     "gpo_clip": Line(lacks=ON_POLICY),
     "gpo_penalty": Line(lacks=ON_POLICY),
@@ -113,6 +116,16 @@ def on_policy(algorithm: str) -> bool:
     return issubclass(algorithm_class(algorithm), OnPolicyAlgorithm)
 
 
+def is_taught(algorithm: str) -> bool:
+    """Whether it trains with a teacher."""
+    return "teacher" in algorithm_class(algorithm).frozen_arguments  # type: ignore[attr-defined]
+
+
+def deployed_role(algorithm: str) -> str:
+    """Name of the policy that acts without privileged entries."""
+    return algorithm_class(algorithm).policy_aliases["MultiInputPolicy"].roles.deployed  # type: ignore[attr-defined]
+
+
 def make(algorithm: str, env: Any, **arguments: Any) -> Any:
     """
     :param algorithm: a key of ``LINES``
@@ -125,7 +138,7 @@ def make(algorithm: str, env: Any, **arguments: Any) -> Any:
     of_policy = {"net_arch": [16], **(SMALL_MEMORY if recurrent else {}), **line.policy_kwargs}
     of_policy |= arguments.pop("policy_kwargs", {})
     small = SMALL_ON_POLICY if on_policy(algorithm) else SMALL_OFF_POLICY
-    taught = {"teacher": teacher_for(env)} if "teacher" in kind.frozen_arguments else {}  # type: ignore[attr-defined]
+    taught = {"teacher": teacher_for(env)} if is_taught(algorithm) and "teacher" not in arguments else {}
     given = {"policy": "MultiInputPolicy", "device": "cpu", **small, **line.arguments, **taught, **arguments}
     return kind(env=env, policy_kwargs=of_policy, **given)
 
@@ -139,6 +152,34 @@ def load(algorithm: str, path: Any, env: Any = None, **arguments: Any) -> Any:
     :return: the model in that file
     """
     return algorithm_class(algorithm).load(path, env=env, **{"device": "cpu", **arguments})  # type: ignore[attr-defined]
+
+
+def save_all(model: Any, folder: Path) -> None:
+    """
+    :param model: to be saved, with its replay buffer if it has one
+    :param folder: of the files
+    """
+    model.save(folder / "model")
+    if not isinstance(model, OnPolicyAlgorithm):
+        model.save_replay_buffer(folder / "buffer")
+
+
+def load_all(algorithm: str, folder: Path, env: Any) -> Any:
+    """
+    :param algorithm: a key of ``LINES``
+    :param folder: of :func:`save_all`
+    :param env: an environment
+    :return: the model, which can go on
+    """
+    model = load(algorithm, folder / "model", env)
+    if not on_policy(algorithm):
+        model.load_replay_buffer(folder / "buffer")
+    return model
+
+
+def parameters(model: Any) -> th.Tensor:
+    """All of its policy, in one vector."""
+    return th.cat([parameter.detach().flatten() for parameter in model.policy.parameters()])
 
 
 def teacher_for(env: Any) -> str:
