@@ -50,12 +50,14 @@ class Line(NamedTuple):
     :param policy_kwargs: the same for its policy
     :param lacks: a key of ``OPTIONS`` -> why the method does not have it
     :param one_phase: arguments with which all gradient steps of a training are of one kind
+    :param remembers: whether the policy that is deployed has a memory whatever its class
     """
 
     arguments: Mapping[str, Any] = NOTHING
     policy_kwargs: Mapping[str, Any] = NOTHING
     lacks: Mapping[str, str] = NOTHING
     one_phase: Mapping[str, Any] = NOTHING
+    remembers: bool = False
 
 
 #: What some methods do not have, and how it is asked for
@@ -69,6 +71,7 @@ OPTIONS = {
     "one entry": Option("entries that its actor does not read, but there are none", make_env=lambda: Sampled(ONE_ENTRY)),
 }
 NO_ENTROPY = {"temperature": "its objective has no entropy term"}
+SEES_THE_SAME = {"shared encoder": "but by role_keys, its other networks see no more than the deployed one"}
 ON_POLICY = {
     "memory": "there is no form with a memory",
     "replay": "it learns from what it has just collected",
@@ -89,9 +92,9 @@ LINES = {
     "gac_without_q": Line(),
     "asymmetric_sac": Line(),
     "asymmetric_mpo": Line({"n_actions": 4}, lacks=NO_ENTROPY),
-    "cosil": Line(lacks=NO_ENTROPY),
-    "rma": Line({"history": 3}, {"encoder_net_arch": [8], "latent_dim": 3}, OF_RMA, one_phase={"phase_1_steps": 10_000}),
-    "tgrl": Line(),
+    "cosil": Line(lacks=NO_ENTROPY | SEES_THE_SAME),
+    "rma": Line({"history": 3}, {"encoder_net_arch": [8], "latent_dim": 3}, OF_RMA, one_phase={"phase_1_steps": 10_000}, remembers=True),
+    "tgrl": Line(lacks=SEES_THE_SAME),
     "gpo_clip": Line(lacks=ON_POLICY),
     "gpo_penalty": Line(lacks=ON_POLICY),
 }
@@ -111,6 +114,23 @@ def algorithms(*options: str, but: tuple[str, ...] = ()) -> pytest.MarkDecorator
     return pytest.mark.parametrize("algorithm", names)
 
 
+def classes(*options: str) -> list[type]:
+    """
+    :param options: keys of ``OPTIONS``
+    :return: the classes of all algorithms that have these options
+    """
+    return [algorithm_class(name) for name, line in LINES.items() if not set(options) & set(line.lacks)]
+
+
+def needed(kind: type, env: Any) -> dict[str, Any]:
+    """
+    :param kind: class of an algorithm
+    :param env: an environment
+    :return: what it can't be made without: a student's teacher, in a file
+    """
+    return {"teacher": teacher_for(env)} if "teacher" in getattr(kind, "frozen_arguments", ()) else {}
+
+
 def on_policy(algorithm: str) -> bool:
     """Whether it learns from rollouts, of which it takes whole ones."""
     return issubclass(algorithm_class(algorithm), OnPolicyAlgorithm)
@@ -126,6 +146,11 @@ def deployed_role(algorithm: str) -> str:
     return algorithm_class(algorithm).policy_aliases["MultiInputPolicy"].roles.deployed  # type: ignore[attr-defined]
 
 
+def small_arguments(algorithm: str) -> dict[str, Any]:
+    """Those that make it small, but its policy's."""
+    return {**(SMALL_ON_POLICY if on_policy(algorithm) else SMALL_OFF_POLICY), **LINES[algorithm].arguments}
+
+
 def make(algorithm: str, env: Any, **arguments: Any) -> Any:
     """
     :param algorithm: a key of ``LINES``
@@ -137,9 +162,8 @@ def make(algorithm: str, env: Any, **arguments: Any) -> Any:
     recurrent = "Gru" in str(arguments.get("policy"))
     of_policy = {"net_arch": [16], **(SMALL_MEMORY if recurrent else {}), **line.policy_kwargs}
     of_policy |= arguments.pop("policy_kwargs", {})
-    small = SMALL_ON_POLICY if on_policy(algorithm) else SMALL_OFF_POLICY
-    taught = {"teacher": teacher_for(env)} if is_taught(algorithm) and "teacher" not in arguments else {}
-    given = {"policy": "MultiInputPolicy", "device": "cpu", **small, **line.arguments, **taught, **arguments}
+    taught = {} if "teacher" in arguments else needed(kind, env)
+    given = {"policy": "MultiInputPolicy", "device": "cpu", **small_arguments(algorithm), **taught, **arguments}
     return kind(env=env, policy_kwargs=of_policy, **given)
 
 

@@ -90,11 +90,11 @@ class Plain:
 
     def __init__(self, policy):
         state = {name: value.detach().double().clone() for name, value in policy.state_dict().items()}
-        encoder = "critic.features_extractor.extractors.1."
+        encoder, of_target = "expert.features_extractor.extractors.1.", "critic_target.features_extractor.extractors.1."
         self.actor = {name: state[f"actor.{name}"].requires_grad_() for name in BODY}
         self.encoder = {name: state[encoder + name].requires_grad_() for name in ENCODER}
         self.critic = {name: state[f"critic.{name}"].requires_grad_() for name in CRITIC}
-        self.encoder_target = {name: state[f"critic_target{encoder[6:]}{name}"] for name in ENCODER}
+        self.encoder_target = {name: state[of_target + name] for name in ENCODER}
         self.critic_target = {name: state[f"critic_target.{name}"] for name in CRITIC}
         self.beta = Coefficient("ent_coef", "auto_0.3", RATE)
 

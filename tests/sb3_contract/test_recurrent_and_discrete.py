@@ -115,7 +115,8 @@ def test_behind_vec_normalize(kind, algorithm, tmp_path):
 
 @kinds
 def test_other_environments_take_the_place_of_the_first(kind, algorithm):
-    model = _model(kind, algorithm).learn(22)  # in the middle of an episode
+    at_once = {} if on_policy(algorithm) else {"train_freq": 1}
+    model = _model(kind, algorithm, **at_once).learn(22)  # in the middle of an episode
     if not on_policy(algorithm):
         with pytest.raises(AssertionError, match="filled by 2 environments, but the model has 3"):
             model.set_env(_env(kind, 3))

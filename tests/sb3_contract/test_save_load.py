@@ -41,6 +41,10 @@ def _image_env():
     return AsDict(FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False), entries=(PARTIAL,))
 
 
+def _images_in_both():
+    return AsDict(FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False))
+
+
 def _of_images(algorithm):
     policy_kwargs = {"features_extractor_kwargs": {"cnn_output_dim": 16}}
     return make(algorithm, vectorized(_image_env), policy_kwargs=policy_kwargs, batch_size=4)
@@ -152,6 +156,27 @@ def test_training_goes_on_after_load_as_if_it_had_not_stopped(algorithm, tmp_pat
     _assert_same_parameters(model.get_parameters(), loaded.get_parameters())
     for name, coefficient in model.coefficients.items():
         assert th.equal(coefficient.value, loaded.coefficients[name].value), name
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "shared"),
+    [*((name, False) for name in LINES), *((name, True) for name, line in LINES.items() if "shared encoder" not in line.lacks)],
+)
+def test_what_several_networks_hold_is_saved_once(algorithm, shared):
+    """And a file of a version that saved it under each of its names is read as well."""
+    policy = make(algorithm, _images_in_both(), policy_kwargs={"share_features_extractor": True} if shared else {}).policy
+    state = policy.state_dict()
+    tensors = [value.data_ptr() for value in state.values() if value.numel()]
+    assert len(tensors) == len(set(tensors))
+    everything = dict(policy.named_parameters(remove_duplicate=False))
+    assert {value.data_ptr() for value in everything.values()} <= set(tensors)
+    with_repetitions = _randomize(state)
+    by_tensor = {state[name].data_ptr(): value for name, value in with_repetitions.items()}
+    with_repetitions |= {name: by_tensor[value.data_ptr()] for name, value in everything.items()}
+    policy.load_state_dict(with_repetitions)
+    _assert_same_tensors(policy.state_dict(), {name: with_repetitions[name] for name in state})
+    with pytest.raises(RuntimeError, match="Missing key"):
+        policy.load_state_dict(dict(list(state.items())[1:]))
 
 
 @algorithms()
@@ -401,4 +426,4 @@ def test_critics_are_saved_and_loaded_alone(algorithm, tmp_path):
 def test_model_is_an_sb3_algorithm(algorithm):
     assert issubclass(algorithm_class(algorithm), BaseAlgorithm)
     model = make(algorithm, pendulum())
-    assert model.actor is model.policy.deployed
+    assert [id(p) for p in model.actor.parameters()] == [id(p) for p in model.policy.deployed.parameters()]

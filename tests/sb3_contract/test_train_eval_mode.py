@@ -123,10 +123,8 @@ def test_statistics_are_copied_wherever_the_policy_was_moved(algorithm):
     model = _make(algorithm).learn(20)
     model.policy.double().float()  # replaces buffers, as a move to another device and back does
     online, targets = _layers(model, nn.BatchNorm1d)
-    for name, layer in targets.items():
-        assert not (layer.running_mean == 7).any()
-        if _online(name) in online:
-            online[_online(name)].running_mean.fill_(7.0)
+    assert not any((layer.running_mean == 7).any() for layer in targets.values())
+    for layer in online.values():
+        layer.running_mean.fill_(7.0)
     model.policy.update_targets(tau=0.5)
-    for name, layer in targets.items():
-        assert (layer.running_mean == 7).all()
+    assert all((layer.running_mean == 7).all() for layer in targets.values())
