@@ -24,7 +24,6 @@ from tests.registry import LINES, algorithms, make, on_policy
 from tests.sb3_contract.helpers import ACTIONS, AsDict, RandomEnv, pendulum
 
 
-
 def _keys(algorithm):
     """SAC's names of what the method has."""
     keys = {"n_updates", "learning_rate", "critic_loss"}

@@ -35,6 +35,6 @@ def test_what_a_method_does_not_have_is_refused(algorithm, option):
 
 @pytest.mark.parametrize("option", OPTIONS)
 def test_only_those_that_lack_an_option_are_left_out_of_its_tests(option):
-    (_, names) = algorithms(option).args
+    _, names = algorithms(option).args
     assert [name for name in LINES if name not in names] == [name for name, line in LINES.items() if option in line.lacks]
     assert names, "or its tests would hold for none"

@@ -160,7 +160,10 @@ def test_training_goes_on_after_load_as_if_it_had_not_stopped(algorithm, tmp_pat
 
 @pytest.mark.parametrize(
     ("algorithm", "shared"),
-    [*((name, False) for name in LINES), *((name, True) for name, line in LINES.items() if "shared encoder" not in line.lacks)],
+    [
+        *((name, False) for name in LINES),
+        *((name, True) for name, line in LINES.items() if "shared encoder" not in line.lacks),
+    ],
 )
 def test_what_several_networks_hold_is_saved_once(algorithm, shared):
     """And a file of a version that saved it under each of its names is read as well."""
