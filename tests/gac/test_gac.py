@@ -113,7 +113,7 @@ def test_target_kl_may_shrink_over_training():
     ("cls", "arguments", "steps"),
     [
         (GAC, {}, 700),
-        (GAC, {"learner_entropy": False}, 700),
+        (GAC, {"learner_entropy": False, "learning_rate": 5e-3}, 1000),
         (GAC, {"guider": "independent", "max_kl": 0.02}, 700),
         (GACShare, {}, 700),
         (GACWithoutQ, {"guider": "independent", "target_kl": 0.3, "learning_rate": 3e-3}, 1500),

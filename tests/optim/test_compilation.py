@@ -13,6 +13,9 @@ from sb3_gac.optim.compile import Program
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
 from tests.registry import LINES, algorithms, load, make, needed
 
+#: Made of what others' programs are made of, which the C++ compiler is given; RMA's are compiled below, both of them
+SIBLINGS = ("gac_share", "gac_without_q", "gpo_penalty", "rma")
+
 
 def _filled(cls, **arguments):
     return small_model(cls=cls, learning_starts=1000, **needed(cls, TwoViewBandit()), **arguments).learn(64)
@@ -32,13 +35,22 @@ def _assert_equal(model, other, **tolerance):
         th.testing.assert_close(coefficient.value, other.coefficients[name].value, **tolerance)
 
 
-@algorithms()
-def test_compiled_training_is_plain_training(algorithm):
+def _check_compiled_is_plain(algorithm):
     of_method = {"seed": 0, **LINES[algorithm].one_phase}
     plain, compiled = (make(algorithm, TwoViewBandit(), compile=flag, **of_method).learn(20) for flag in (False, True))
     assert compiled.programs
     assert plain._n_updates == compiled._n_updates > 1
     _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
+
+
+@algorithms(but=SIBLINGS)
+def test_compiled_training_is_plain_training(algorithm):
+    _check_compiled_is_plain(algorithm)
+
+
+@pytest.mark.parametrize("algorithm", SIBLINGS)
+def test_traced_training_is_plain_training(algorithm, traced):
+    _check_compiled_is_plain(algorithm)
 
 
 @pytest.fixture
@@ -146,7 +158,7 @@ def test_an_optimiser_that_can_not_be_compiled_is_named():
         (COSIL, "target_divergence", 1e3, {"target_divergence": 0.0, "teacher_coef_learning_rate": 1.0}),
     ],
 )
-def test_a_setting_that_is_compiled_in_is_noticed(cls, setting, value, before):
+def test_a_setting_that_is_compiled_in_is_noticed(cls, setting, value, before, traced):
     plain, compiled, unchanged = _filled(cls, **before), _filled(cls, compile=True, **before), _filled(cls, **before)
     _train((plain, compiled, unchanged))
     for model in (plain, compiled):
