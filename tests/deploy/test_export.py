@@ -119,7 +119,7 @@ def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
 def test_a_memory_is_carried_and_reset(kind, tmp_path):
     """500 sequences of 20 observations, twice."""
     model = WITH_MEMORY[kind]().learn(60)
-    unlike_each_other(model.policy, scale=0.2 if "image" in kind else 1.0)
+    unlike_each_other(model.policy, scale=0.2 if "image" in kind or kind in LINES else 1.0)
     learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx"))
     script = th.jit.load(str(export_learner(model, tmp_path / "learner.pt")))
     sequence = [_drawn(model, 500, seed=step) for step in range(20)]

@@ -319,7 +319,7 @@ def test_a_guider_of_one_entry_still_needs_what_its_learner_reads():
 @pytest.mark.parametrize("cls", ALGORITHMS)
 @pytest.mark.parametrize("keys", [["priviledged"], "privileged", []])
 def test_role_keys_are_named_as_they_were_written(cls, keys):
-    roles = ["critic", *cls.policy_aliases["MultiInputPolicy"].roles.all]
+    roles = ["critic", *cls.policy_aliases["MultiInputPolicy"].roles.networks]
     for role in roles:
         with pytest.raises(ValueError, match=rf'^role_keys\["{role}"\]'):
             small_model(cls=cls, role_keys={role: keys})
