@@ -138,7 +138,10 @@ class Sampled(gym.Env):
 
 
 def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
-    """A model whose gradient steps take a few milliseconds."""
+    """A model whose gradient steps take a few milliseconds; a student has a teacher."""
+    from tests.registry import needed  # which needs the environments above
+
+    env = TwoViewBandit() if env is None else env
     defaults = {
         "policy": "MultiInputPolicy",
         "learning_starts": 10,
@@ -148,7 +151,9 @@ def small_model(env: Any = None, cls: type[GAC] = GAC, **arguments: Any) -> GAC:
         "device": "cpu",
         "policy_kwargs": {"net_arch": [16]},
     }
-    return cls(**{"policy": "MultiInputPolicy", "env": TwoViewBandit() if env is None else env, **defaults, **arguments})
+    if "teacher" not in arguments:
+        defaults |= needed(cls, env)
+    return cls(**{"env": env, **defaults, **arguments})
 
 
 def optimizers_of(policy: Any) -> list[Any]:

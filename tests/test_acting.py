@@ -8,11 +8,13 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import GAC, AsymmetricSAC
+from sb3_gac.algorithms import name_of
 from tests.helpers import Sampled, optimizers_of, small_model, unlike_each_other
 from tests.plain.replay import Recorded
+from tests.registry import LINES, classes
 
-ALGORITHMS = pytest.mark.parametrize("cls", [GAC, GACShare, GACWithoutQ, AsymmetricSAC])
+ALGORITHMS = pytest.mark.parametrize("cls", classes("replay"))
 
 
 def _far_up():
@@ -20,7 +22,11 @@ def _far_up():
     return NormalActionNoise(np.full(2, 10.0), np.zeros(2))
 
 
-@ALGORITHMS
+#: What remembers goes along from the first step on
+FORGETFUL = [kind for kind in classes("replay") if not LINES[name_of(kind)].remembers]
+
+
+@pytest.mark.parametrize("cls", FORGETFUL)
 def test_the_behaviour_policy_acts_from_the_first_step_after_warm_up(cls):
     model = small_model(Recorded(), cls, learning_starts=10)
     steps, behave = [], model.policy.behaviour_action
@@ -86,7 +92,7 @@ def test_what_the_guider_does_is_what_its_distribution_says(guider, shared_std):
     )
 
 
-@ALGORITHMS
+@pytest.mark.parametrize("cls", classes("replay", "memory"))
 @pytest.mark.parametrize("policy", ["MultiInputPolicy", "MultiInputGruPolicy", "MultiInputLstmPolicy"])
 def test_predict_gives_actions_in_the_environments_range_and_samples_on_request(cls, policy):
     model = small_model(Recorded(), cls, policy=policy, policy_kwargs={"net_arch": [8]})
@@ -105,14 +111,14 @@ def test_predict_gives_actions_in_the_environments_range_and_samples_on_request(
     assert model.action_space.contains(sampled.max(axis=0))
 
 
-@ALGORITHMS
+@pytest.mark.parametrize("cls", classes("replay", "temperature"))
 def test_all_rates_but_kl_coefs_follow_the_schedule(cls):
     model = small_model(cls=cls, learning_rate=LinearSchedule(1e-3, 5e-4, 1.0)).learn(50)
     expected = model.lr_schedule(model._current_progress_remaining)
     assert 5e-4 <= expected < 6e-4
     for optimizer in (*optimizers_of(model.policy), model.ent_coef_optimizer):
         assert optimizer.param_groups[0]["lr"] == pytest.approx(expected)
-    if cls is not AsymmetricSAC:
+    if issubclass(cls, GAC):
         assert model.kl_coef_dual.optimizer.param_groups[0]["lr"] == model.kl_coef_learning_rate
 
 

@@ -5,6 +5,7 @@ and of one that acts as its guider.
 """
 
 from copy import deepcopy
+from functools import partial
 
 import numpy as np
 import onnx
@@ -15,9 +16,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricMPO, AsymmetricSAC, GPOClip, GPOPenalty, OnnxPolicy, export_learner
+from sb3_gac import GAC, RMA, AsymmetricMPO, GPOClip, GPOPenalty, OnnxPolicy, export_learner
 from sb3_gac.envs import History
 from tests.helpers import Sampled, small_model
+from tests.registry import LINES, make
 
 VECTOR, IMAGE = spaces.Box(-1, 1, (3,), np.float32), spaces.Box(0, 255, (3, 36, 36), np.uint8)
 VECTORS = spaces.Dict(partial=VECTOR, privileged=spaces.Box(-np.inf, np.inf, (2,), np.float32))
@@ -47,7 +49,7 @@ def _normalised(action_space=None):
 
 
 KINDS = {
-    "mlp": lambda: small_model(Sampled(VECTORS)),
+    **{name: partial(make, name, Sampled(VECTORS), seed=0) for name in LINES},
     "mlp, lagged": lambda: small_model(Sampled(VECTORS), guider="lagged"),
     "mlp, two networks": lambda: small_model(Sampled(VECTORS), guider="independent"),
     "mlp, shared encoder": lambda: small_model(Sampled(VECTORS), policy_kwargs=SHARED),
@@ -61,19 +63,13 @@ KINDS = {
     "lstm": lambda: _recurrent("Lstm", Sampled(VECTORS)),
     "lstm, discrete": lambda: _recurrent("Lstm", Sampled(VECTORS, CHOICE)),
     "history, two entries": lambda: small_model(History(Sampled(SEVERAL), 3, actions=True), **READS_TWO),
-    "asymmetric SAC": lambda: small_model(Sampled(VECTORS), cls=AsymmetricSAC),
     "gru of the learner alone": lambda: _recurrent("", Sampled(VECTORS), {"rnn_type": {"learner": "gru"}}),
     "cnn of the learner alone": lambda: small_model(Sampled(IMAGES), policy_kwargs=CNN, role_keys=STATE),
-    "COSIL": lambda: small_model(Sampled(VECTORS), cls=COSIL, teacher=small_model(Sampled(VECTORS), cls=AsymmetricSAC)),
-    "GPO": lambda: _on_policy(Sampled(VECTORS)),
     "GPO, normalised": lambda: _on_policy(_normalised()),
     "GPO, cnn, discrete": lambda: _on_policy(Sampled(IMAGES, CHOICE), CNN),
     "GPO-penalty, shared encoder": lambda: _on_policy(Sampled(VECTORS), SHARED, GPOPenalty),
-    "TGRL": lambda: small_model(Sampled(VECTORS), cls=TGRL, teacher=small_model(Sampled(VECTORS), cls=AsymmetricSAC)),
-    "RMA": lambda: small_model(Sampled(VECTORS), cls=RMA, history=3),
     "RMA, discrete, normalised": lambda: small_model(_normalised(CHOICE), cls=RMA, history=12),
     "RMA, cnn": lambda: small_model(Sampled(IMAGES), cls=RMA, history=2, policy_kwargs=CNN, batch_size=4),
-    "asymmetric MPO": lambda: small_model(Sampled(VECTORS), cls=AsymmetricMPO, n_actions=4),
     "asymmetric MPO, gru": lambda: _recurrent("Gru", Sampled(VECTORS), cls=AsymmetricMPO),
 }
 

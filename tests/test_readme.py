@@ -15,18 +15,20 @@ from sb3_gac import GAC
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-SHORTER = {"100_000": "600", "1_000_000": "300", "5_000": "150", "20_000": "100", "200_000": "120"}
+SHORTER = {"1_000_000": "120", "5_000": "60", "20_000": "50", "200_000": "110"}
 SMALL = {"learning_starts": 100, "batch_size": 16, "buffer_size": 1_000, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
 
 
 def _shorter(block):
-    return re.sub(r"\b[0-9]+_[0-9_]+\b", lambda number: SHORTER[number.group()], block)
+    (warm_up,) = re.findall("learning_starts=([0-9]+)", block)[:1] or ["100"]
+    shorter = SHORTER | {"100_000": str(int(warm_up) + 20)}
+    return re.sub(r"\b[0-9]+_[0-9_]+\b", lambda number: shorter[number.group()], block)
 
 
 def _names_by_then():
     """What the text around a block has told the reader to have."""
-    env, eval_env = (gym.make("sb3_gac/HalfCheetah-v5", noise_std=0.1) for _ in range(2))
-    model = GAC("MultiInputPolicy", env, **SMALL).learn(150)
+    env, eval_env = (gym.make("sb3_gac/HalfCheetah-v5", noise_std=0.1, max_episode_steps=50) for _ in range(2))
+    model = GAC("MultiInputPolicy", env, **SMALL).learn(110)
     partial = env.observation_space["partial"].sample()
     return {"gymnasium": gym, "np": np, "GAC": GAC, "env": env, "eval_env": eval_env, "model": model, "partial": partial}
 

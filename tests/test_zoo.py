@@ -13,85 +13,82 @@ pytest.importorskip("rl_zoo3")
 from sb3_gac import envs
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
 from sb3_gac.zoo import convert, hyperparameters, main, sample, with_hyperparameters
+from tests.registry import LINES, algorithms, is_taught, small_arguments, teacher_for
 
-TRAINED = ("gac", "asymmetric_sac")
-TAUGHT = sorted(name for name in ALGORITHMS if "teacher" in algorithm_class(name).frozen_arguments)
 ENV = "sb3_gac/InvertedDoublePendulum-v5"
-QUICK = ["learning_starts:20", "batch_size:8", "policy_kwargs:dict(net_arch=[8])", "n_envs:1", "gradient_steps:1"]
+WITH_NOISE = ("--env-kwargs", "noise_std:0.2")
 
 
-def _zoo(script, folder, *options):
-    command = [sys.executable, "-m", "sb3_gac.zoo", script, "--env", ENV, *map(str, options)]
-    environment = {**os.environ, "MUJOCO_GL": "egl", "OMP_NUM_THREADS": "1"}
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
-    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-4000:]
-    return result.stdout
+def _small(algorithm):
+    """As the zoo takes arguments."""
+    of_policy = {"net_arch": [8], **LINES[algorithm].policy_kwargs}
+    arguments = {"n_envs": 1, "policy_kwargs": of_policy, "gradient_steps": 1, **small_arguments(algorithm)}
+    arguments |= {"teacher": teacher_for(ENV)} if is_taught(algorithm) else {}
+    if not issubclass(algorithm_class(algorithm), OffPolicyAlgorithm):
+        del arguments["gradient_steps"]
+    return ["-params", *(f"{name}:{value!r}" for name, value in arguments.items())]
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A folder in which each algorithm was trained for a moment."""
+def zoo(tmp_path_factory):
+    """Calls a script of the zoo in this process, in a folder of its own: script, options -> that folder."""
     folder = tmp_path_factory.mktemp("zoo")
-    for algorithm in TRAINED:
-        options = ("--algo", algorithm, "-n", 120, "--env-kwargs", "noise_std:0.2", "--eval-freq", 60, "--eval-episodes", 1)
-        _zoo("train", folder, *options, "-params", *QUICK)
-    return folder
+    with pytest.MonkeyPatch.context() as context:
+        context.chdir(folder)
+
+        def call(script, *options):
+            context.setattr(sys, "argv", ["zoo"])
+            main([script, *map(str, options)])
+            return folder
+
+        yield call
 
 
-@pytest.mark.parametrize("algorithm", TRAINED)
-def test_train_saves_what_the_zoo_saves(trained, algorithm):
-    (run,) = (trained / "logs" / algorithm).iterdir()
+def _train(zoo, algorithm, *options):
+    return zoo("train", "--algo", algorithm, "--env", ENV, *WITH_NOISE, *options, *_small(algorithm))
+
+
+@pytest.fixture(scope="module", params=list(LINES))
+def trained(request, zoo):
+    """An algorithm that was trained for a moment, and the folder of its files."""
+    return request.param, _train(zoo, request.param, "-n", 40, "--eval-freq", 20, "--eval-episodes", 1)
+
+
+def test_train_saves_what_the_zoo_saves(trained):
+    algorithm, folder = trained
+    (run,) = (folder / "logs" / algorithm).iterdir()
     files = {path.name for path in run.rglob("*")}
     assert {"best_model.zip", "config.yml", "args.yml", "evaluations.npz"} <= files
     config = next(run.rglob("config.yml")).read_text()
     assert "MultiInputPolicy" in config
-    assert "privileged" in config, "from our YAML: critics on the state alone"
+    if hyperparameters(algorithm)[ENV].get("role_keys"):
+        assert "privileged" in config, "from our YAML: critics on the state alone"
 
 
-@pytest.mark.parametrize("algorithm", TRAINED)
-def test_enjoy_runs_the_deployed_policy(trained, algorithm):
-    output = _zoo("enjoy", trained, "--algo", algorithm, "--folder", "logs", "-n", 50, "--no-render")
-    assert "Mean reward" in output
-
-
-@pytest.mark.parametrize("algorithm", TAUGHT)
-def test_a_student_trains_with_a_teachers_file_and_acts(algorithm, tmp_path, monkeypatch, capsys):
-    env = envs.make_mujoco("InvertedDoublePendulum", noise_std=0.2)
-    algorithm_class("asymmetric_sac")("MultiInputPolicy", env, buffer_size=10).save(tmp_path / "teacher.zip")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["zoo"])
-    given = ["--algo", algorithm, "--env", ENV]
-    own = ["-n", "60", "--env-kwargs", "noise_std:0.2", "--eval-freq", "-1", "-params", *QUICK, "teacher:'teacher.zip'"]
-    main(["train", *given, *own])
-    main(["enjoy", *given, "--folder", "logs", "-n", "20", "--no-render"])
+def test_enjoy_runs_the_deployed_policy(trained, zoo, capsys):
+    algorithm, _ = trained
+    zoo("enjoy", "--algo", algorithm, "--env", ENV, "--folder", "logs", "-n", 20, "--no-render")
     assert "Mean reward" in capsys.readouterr().out
-    trials = ["-optimize", "--n-trials", "1", "--n-jobs", "1", "--n-evaluations", "1", "--eval-episodes", "1"]
-    main(["train", *given, "-n", "30", *trials, "--no-optim-plots", "-params", *QUICK, "teacher:'teacher.zip'"])
-    assert "Best trial" in capsys.readouterr().out
 
 
-def test_record_video_writes_one(trained):
-    _zoo("record_video", trained, "--algo", "gac", "--folder", "logs", "-n", 20)
-    assert list(trained.rglob("*.mp4"))
+@algorithms()
+def test_optimize_samples_and_trains(algorithm, zoo, capsys):
+    trials = ("-optimize", "--n-trials", 1, "--n-jobs", 1, "--n-evaluations", 1, "--eval-episodes", 1, "--no-optim-plots")
+    _train(zoo, algorithm, "-n", 20, *trials)
+    printed = capsys.readouterr().out
+    assert "Best trial" in printed
+    assert "learning_rate" in printed
 
 
-def test_optimize_samples_and_trains(trained):
-    options = (
-        "--algo",
-        "gac",
-        "-n",
-        60,
-        "-optimize",
-        "--n-trials",
-        2,
-        "--n-jobs",
-        1,
-        "--no-optim-plots",
-        "--eval-episodes",
-        1,
-    )
-    output = _zoo("train", trained, *options, "--n-evaluations", 1, "-params", "learning_starts:20", "n_envs:1")
-    assert "target_kl" in output
+def test_the_programs_run_as_commands(tmp_path):
+    """Train, then record a video of it."""
+    environment = {**os.environ, "MUJOCO_GL": "egl", "OMP_NUM_THREADS": "1"}
+    train = ("train", "-n", 30, "--eval-freq", -1, *_small("gac"))
+    for script, *options in (train, ("record_video", "--folder", "logs", "-n", 20)):
+        command = [sys.executable, "-m", "sb3_gac.zoo", script, "--algo", "gac", "--env", ENV, *map(str, options)]
+        result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+        assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-4000:]
+    assert list(tmp_path.rglob("*.mp4"))
 
 
 def test_sampled_values_become_arguments():
@@ -122,24 +119,10 @@ def test_a_file_of_ones_own_and_other_algorithms_are_left_to_the_zoo(options, tm
     assert with_hyperparameters(options, tmp_path) == options
 
 
-def test_the_zoos_own_algorithms_train(tmp_path):
-    options = (
-        "train",
-        "--algo",
-        "ppo",
-        "--env",
-        "CartPole-v1",
-        "-n",
-        "64",
-        "-params",
-        "n_envs:1",
-        "n_steps:32",
-        "batch_size:32",
-    )
-    command = [sys.executable, "-m", "sb3_gac.zoo", *options]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr[-4000:]
-    assert (tmp_path / "logs" / "ppo").is_dir()
+def test_the_zoos_own_algorithms_train(zoo):
+    small = ("-params", "n_envs:1", "n_steps:32", "batch_size:32")
+    folder = zoo("train", "--algo", "ppo", "--env", "CartPole-v1", "-n", 32, "--eval-freq", -1, *small)
+    assert (folder / "logs" / "ppo").is_dir()
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

@@ -31,6 +31,7 @@ from sb3_gac.networks.critics import CriticEnsemble, DiscreteCriticEnsemble
 from sb3_gac.networks.encoders import EntryExtractor, VectorExtractor
 from sb3_gac.networks.heads import LOG_STD_BOUNDS
 from sb3_gac.networks.recurrent import RecurrentCore
+from sb3_gac.networks.tied import write_each_tensor_once
 from sb3_gac.networks.values import StateValue
 from sb3_gac.optim.polyak import polyak_average
 from sb3_gac.optim.trained import TrainedParameters
@@ -183,6 +184,7 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
         for role in self.roles.values:
             setattr(self, role, StateValue(**self._role_kwargs(role, shared)))
         self.tie_networks()
+        write_each_tensor_once(self)
         pairs = self.pairs.values()
         self._followed: list[th.Tensor] = [parameter for network, _ in pairs for parameter in network.parameters()]
         self._following: list[th.Tensor] = [parameter for _, target in pairs for parameter in target.parameters()]

@@ -24,7 +24,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, EnvironmentFailedError, GACShare, GACWithoutQ, InvalidStepError
+from sb3_gac import GAC, AsymmetricSAC, EnvironmentFailedError, InvalidStepError
 from sb3_gac.checks import processes
 from sb3_gac.checks.environments import guard_of
 from sb3_gac.checks.processes import WatchedPipe, end_processes
@@ -32,8 +32,9 @@ from sb3_gac.checks.uses import SuspiciousEnds
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from tests.diary import Diary, DiaryEnv, assert_true_and_whole, stored_transitions
 from tests.helpers import TwoViewBandit, small_model
+from tests.registry import classes
 
-ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
+ALGORITHMS = classes("replay")
 KINDS = [
     *((cls, "MultiInputPolicy", CompactDictReplayBuffer) for cls in ALGORITHMS),
     (GAC, "MultiInputPolicy", DictReplayBuffer),

@@ -10,12 +10,13 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import GAC, AsymmetricSAC
 from sb3_gac.base.update import scale_of
 from sb3_gac.optim.trained import TrainedParameters
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
+from tests.registry import classes
 
-ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
+ALGORITHMS = classes("replay", "shared encoder")
 
 
 class Encoder(BaseFeaturesExtractor):

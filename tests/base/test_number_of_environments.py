@@ -7,10 +7,11 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import GAC
 from tests.helpers import Recall, small_model
+from tests.registry import classes
 
-ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
+ALGORITHMS = classes("replay", "memory")
 NOISES = {
     "no noise": lambda: None,
     "normal": lambda: NormalActionNoise(np.zeros(1), 0.1 * np.ones(1)),

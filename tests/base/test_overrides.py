@@ -8,12 +8,13 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer
 
-from sb3_gac import GAC, AsymmetricSAC, EpisodeReplayBuffer, GACShare, GACWithoutQ
+from sb3_gac import GAC, AsymmetricSAC, EpisodeReplayBuffer, GACShare
 from sb3_gac.base.overrides import algorithm_of
 from sb3_gac.optim.coefficients import AdditiveCoefficient
 from tests.helpers import Recall, TwoViewBandit, optimizers_of, small_model
+from tests.registry import classes
 
-ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
+ALGORITHMS = classes("replay")
 HOW = ["load", "resume"]
 
 

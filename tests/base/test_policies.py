@@ -7,10 +7,16 @@ from gymnasium import spaces
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare
 from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice, optimizers_of, small_model, unlike_each_other
+from tests.registry import classes
 
 IMAGE = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=spaces.Box(-1, 1, (2,), np.float32))
 CNN = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}, "share_features_extractor": True}
-ALGORITHMS = pytest.mark.parametrize("cls", [GAC, GACShare, AsymmetricSAC])
+ALGORITHMS = pytest.mark.parametrize("cls", classes("critics"))
+
+
+def _critics(policy):
+    """Each with its target."""
+    return [policy.pairs[role] for role in policy.roles.critics if role in policy.pairs]
 
 
 def _same(one, other):
@@ -21,7 +27,7 @@ def _same(one, other):
 @pytest.mark.parametrize("env", [TwoViewBandit, TwoViewChoice])
 def test_targets_start_as_their_critics_and_stay_until_they_are_averaged(cls, env):
     policy = small_model(env(), cls).policy
-    for critic, target in policy.pairs.values():
+    for critic, target in _critics(policy):
         assert _same(critic, target)
         members = next(iter(critic.parameters()))
         assert not th.equal(members[0], members[1]), "two critics, not one twice"
@@ -34,12 +40,12 @@ def test_targets_start_as_their_critics_and_stay_until_they_are_averaged(cls, en
             th.testing.assert_close(p, was + 0.25)
 
 
-@ALGORITHMS
+@pytest.mark.parametrize("cls", classes("critics", "shared encoder"))
 def test_a_targets_encoder_is_its_own_where_the_learners_is_shared(cls):
     """Or the target would follow the learner's loss at once, and not by averaging."""
     policy = small_model(Sampled(IMAGE), cls, policy_kwargs=CNN).policy
     of_deployed = {id(parameter) for parameter in policy.deployed.parameters()}
-    for critic, target in policy.pairs.values():
+    for critic, target in _critics(policy):
         assert of_deployed & {id(parameter) for parameter in critic.parameters()}
         assert not of_deployed & {id(parameter) for parameter in target.parameters()}
         assert _same(critic, target)
@@ -49,7 +55,8 @@ def test_a_targets_encoder_is_its_own_where_the_learners_is_shared(cls):
 def test_policies_and_critics_may_differ_in_size(cls):
     policy = small_model(cls=cls, policy_kwargs={"net_arch": {"pi": [8], "qf": [4, 5]}}).policy
     assert policy.deployed.net_arch == [8]
-    assert [critic.net_arch for pair in policy.pairs.values() for critic in pair] == [[4, 5]] * 2 * len(policy.pairs)
+    pairs = _critics(policy)
+    assert [critic.net_arch for pair in pairs for critic in pair] == [[4, 5]] * 2 * len(pairs)
 
 
 @pytest.mark.parametrize(("guider", "starts_at_the_learner"), [("residual", True), ("independent", False)])

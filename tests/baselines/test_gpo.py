@@ -365,14 +365,6 @@ def _tensors(obs):
     return {key: th.as_tensor(value)[None] for key, value in obs.items()}
 
 
-@pytest.mark.parametrize("cls", BOTH)
-def test_compiled_is_plain(cls):
-    plain, compiled = (make_model(cls=cls, compile=compile).learn(48) for compile in (False, True))
-    assert compiled.programs
-    for p, q in zip(plain.policy.parameters(), compiled.policy.parameters(), strict=True):
-        th.testing.assert_close(p, q, rtol=1e-4, atol=1e-5)
-
-
 def test_observations_may_be_normalised(tmp_path):
     def make_env():
         return VecNormalize(DummyVecEnv([lambda: TwoViewBandit(length=3)]), norm_reward=False, clip_obs=5.0)

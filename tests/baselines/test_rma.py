@@ -90,11 +90,11 @@ class Plain:
 
     def __init__(self, policy):
         state = {name: value.detach().double().clone() for name, value in policy.state_dict().items()}
-        encoder = "critic.features_extractor.extractors.1."
+        encoder, of_target = "expert.features_extractor.extractors.1.", "critic_target.features_extractor.extractors.1."
         self.actor = {name: state[f"actor.{name}"].requires_grad_() for name in BODY}
         self.encoder = {name: state[encoder + name].requires_grad_() for name in ENCODER}
         self.critic = {name: state[f"critic.{name}"].requires_grad_() for name in CRITIC}
-        self.encoder_target = {name: state[f"critic_target{encoder[6:]}{name}"] for name in ENCODER}
+        self.encoder_target = {name: state[of_target + name] for name in ENCODER}
         self.critic_target = {name: state[f"critic_target.{name}"] for name in CRITIC}
         self.beta = Coefficient("ent_coef", "auto_0.3", RATE)
 
@@ -189,9 +189,7 @@ def test_a_gradient_step_of_phase_1_is_the_plain_one():
     groups = {
         "actor.": plain.actor,
         "critic.": plain.critic,
-        f"critic.{encoder}": plain.encoder,
         f"expert.{encoder}": plain.encoder,
-        "expert.": plain.actor,
         "critic_target.": plain.critic_target,
         f"critic_target.{encoder}": plain.encoder_target,
     }
@@ -199,6 +197,10 @@ def test_a_gradient_step_of_phase_1_is_the_plain_one():
         for name, value in group.items():
             np.testing.assert_allclose(now[prefix + name], value.detach(), rtol=1e-4, atol=5e-6, err_msg=prefix + name)
             assert not th.allclose(now[prefix + name], before[prefix + name], atol=1e-5), f"{prefix}{name} stood still"
+    actor, expert, critic = model.policy.actor, model.policy.expert, model.policy.critic
+    assert expert.latent_net is actor.latent_net
+    assert expert.head is actor.head
+    assert expert.features_extractor.extractors[-1] is critic.features_extractor.extractors[-1]
     assert model.coefficients["ent_coef"].value.item() == pytest.approx(plain.beta.value.item(), rel=1e-5)
 
 

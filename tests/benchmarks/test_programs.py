@@ -1,6 +1,7 @@
 """The benchmark programs, run as a user runs them, on a suite of seconds."""
 
 import importlib
+import itertools
 import json
 import re
 import shutil
@@ -56,6 +57,32 @@ def runs(tmp_path_factory):
     return directory
 
 
+@pytest.fixture(scope="module")
+def made(runs, tmp_path_factory):
+    """The results of these runs, through aggregate."""
+    out = tmp_path_factory.mktemp("results") / "smoke"
+    result = _program("benchmarks.aggregate", SMOKE, "--runs", runs, "--out", out)
+    assert result.returncode == 0, result.stderr
+    return out
+
+
+@pytest.fixture
+def program(monkeypatch, capsys):
+    """Calls a program in this process: module, arguments, whether it ends with an error -> what it printed."""
+
+    def call(module, *arguments, fails=False):
+        monkeypatch.setattr(sys, "argv", [module, *map(str, arguments)])
+        code = None
+        try:
+            importlib.import_module(module).main()
+        except SystemExit as end:
+            code = end.code
+        assert bool(code) == fails
+        return capsys.readouterr().out
+
+    return call
+
+
 def test_each_run_leaves_its_evaluations_configuration_and_model(runs):
     for spec in read_suite(SMOKE):
         directory = spec.directory(runs)
@@ -75,47 +102,42 @@ def test_each_run_leaves_its_evaluations_configuration_and_model(runs):
     assert not gac.equals(gac_again), "the seed does something"
 
 
-def test_a_finished_run_is_skipped_and_an_unfinished_one_done_again(runs):
+def test_a_finished_run_is_skipped_and_an_unfinished_one_done_again(runs, program):
     first, second = (spec.directory(runs) / "evaluations.csv" for spec in read_suite(SMOKE)[:2])
     before = first.read_text(), first.stat().st_mtime_ns
     wanted = second.read_text()
     second.unlink()
-    dry = _program("benchmarks.launch", SMOKE, "--runs", runs, "--dry-run")
-    assert dry.stdout.count("benchmarks.run") == 1
-    result = _program("benchmarks.launch", SMOKE, "--runs", runs)
-    assert "3 were finished before, 1 now, 0 failed." in result.stdout
+    assert program("benchmarks.launch", SMOKE, "--runs", runs, "--dry-run").count("benchmarks.run") == 1
+    assert "3 were finished before, 1 now, 0 failed." in program("benchmarks.launch", SMOKE, "--runs", runs)
     assert (first.read_text(), first.stat().st_mtime_ns) == before
     assert second.read_text() == wanted, "the same seed gives the same run"
 
 
-def test_results_are_aggregated_and_reported(runs, tmp_path):
-    out = tmp_path / "smoke"
-    result = _program("benchmarks.aggregate", SMOKE, "--runs", runs, "--out", out)
-    assert result.returncode == 0, result.stderr
-    record = json.loads((tmp_path / "smoke.json").read_text())
+def test_results_are_aggregated_and_reported(runs, made):
+    record = json.loads(made.with_suffix(".json").read_text())
     assert record["reference"] == "sac-asym"
     assert len(record["made_with"]) == 1
     assert record["mixed_runs"] == []
     options = f"--runs {runs}"
     assert record["command"] == (
         f"python -m benchmarks.launch benchmarks/suites/smoke.yml {options} && "
-        f"python -m benchmarks.aggregate benchmarks/suites/smoke.yml {options} --out {out}"
+        f"python -m benchmarks.aggregate benchmarks/suites/smoke.yml {options} --out {made}"
     )
     assert [(cell["algorithm"], cell["seeds"]) for cell in record["cells"]] == [("gac", [0, 1]), ("sac-asym", [0, 1])]
     assert "guider_mean" in record["cells"][0]
     assert "guider_mean" not in record["cells"][1]
-    assert len(pd.read_csv(tmp_path / "smoke.csv")) == 12
-    result = _program("benchmarks.report", out)
+    assert len(pd.read_csv(made.with_suffix(".csv"))) == 12
+    result = _program("benchmarks.report", made)
     assert result.returncode == 0, result.stderr
     assert "| InvertedDoublePendulum | 0.1 | sac-asym |" in result.stdout
-    assert (tmp_path / "smoke.png").stat().st_size > 10_000
-    page = (tmp_path / "smoke.html").read_text()
+    assert made.with_suffix(".png").stat().st_size > 10_000
+    page = made.with_suffix(".html").read_text()
     assert "<title>smoke</title>" in page
     assert "sac-asym, seed 1" in page
     assert not re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="http', page), "nothing is loaded from elsewhere"
 
 
-def test_a_missing_run_is_an_error_or_leaves_its_whole_cell_out(runs, tmp_path):
+def test_a_missing_run_is_an_error_or_leaves_its_whole_cell_out(runs, tmp_path, program):
     with pytest.raises(FileNotFoundError, match="4 runs are not finished"):
         finished_runs(SMOKE, tmp_path)
     suite = yaml.safe_load(SMOKE.read_text())
@@ -124,51 +146,45 @@ def test_a_missing_run_is_an_error_or_leaves_its_whole_cell_out(runs, tmp_path):
     path.write_text(yaml.safe_dump(suite))
     with pytest.raises(FileNotFoundError, match="8 runs are not finished"):
         finished_runs(path, runs)
-    result = _program("benchmarks.aggregate", path, "--runs", runs, "--out", tmp_path / "grown", "--complete-cells")
-    assert result.returncode == 0, result.stderr
+    program("benchmarks.aggregate", path, "--runs", runs, "--out", tmp_path / "grown", "--complete-cells")
     record = json.loads((tmp_path / "grown.json").read_text())
     assert len(record["still_to_run"]) == 8
     assert "small-600/InvertedDoublePendulum-noise0.2/gac/seed2" in record["still_to_run"]
     assert [cell["seeds"] for cell in record["cells"]] == [[0, 1], [0, 1]]
 
 
-def test_runs_without_their_directories_count_by_the_results_that_they_went_into(runs, tmp_path):
-    program = ("benchmarks.aggregate", SMOKE, "--runs")
-    assert _program(*program, runs, "--out", tmp_path / "made").returncode == 0
-    elsewhere = tmp_path / "elsewhere"
-    result = _program(*program, elsewhere, "--reuse-results", tmp_path / "made", "--out", tmp_path / "again")
-    assert result.returncode == 0, result.stderr
-    assert (tmp_path / "made.csv").read_text() == (tmp_path / "again.csv").read_text()
-    made, again = (json.loads((tmp_path / name).read_text()) for name in ("made.json", "again.json"))
-    assert made.pop("command") != again.pop("command")
-    assert again == made
+def test_runs_without_their_directories_count_by_the_results_that_they_went_into(runs, made, tmp_path, program):
+    elsewhere, again = tmp_path / "elsewhere", tmp_path / "again"
+    program("benchmarks.aggregate", SMOKE, "--runs", elsewhere, "--reuse-results", made, "--out", again)
+    assert made.with_suffix(".csv").read_text() == again.with_suffix(".csv").read_text()
+    record, record_again = (json.loads(path.with_suffix(".json").read_text()) for path in (made, again))
+    assert record.pop("command") != record_again.pop("command")
+    assert record_again == record
     names = [name_of(spec) for spec in read_suite(SMOKE)]
-    assert list(made["runs"]) == names
+    assert list(record["runs"]) == names
 
     (elsewhere / names[0]).parent.mkdir(parents=True)
     shutil.copytree(runs / names[0], elsewhere / names[0])
     table = pd.read_csv(elsewhere / names[0] / "evaluations.csv")
     table.assign(learner=7.0).to_csv(elsewhere / names[0] / "evaluations.csv", index=False)
-    counted, missing = finished_runs(SMOKE, elsewhere, reuse=[tmp_path / "made"])
+    counted, missing = finished_runs(SMOKE, elsewhere, reuse=[made])
     assert [run.name for run in counted] == names
     assert not missing
     assert (counted[0].evaluations.learner == 7.0).all(), "a directory comes before what was made earlier"
-    table = pd.read_csv(tmp_path / "made.csv")
+    table = pd.read_csv(made.with_suffix(".csv"))
     table.assign(learner=8.0).to_csv(tmp_path / "later.csv", index=False)
-    shutil.copy(tmp_path / "made.json", tmp_path / "later.json")
-    counted, _ = finished_runs(SMOKE, elsewhere, reuse=[tmp_path / "made", tmp_path / "later"])
+    shutil.copy(made.with_suffix(".json"), tmp_path / "later.json")
+    counted, _ = finished_runs(SMOKE, elsewhere, reuse=[made, tmp_path / "later"])
     assert [run.evaluations.learner.iloc[0] for run in counted] == [7.0, 8.0, 8.0, 8.0], "the last of several counts"
-    _, missing = finished_runs(SMOKE, runs, True, [tmp_path / "made"], rerun=["gac"])
+    _, missing = finished_runs(SMOKE, runs, True, [made], rerun=["gac"])
     assert not missing, "directories count in any case"
     with pytest.raises(FileNotFoundError, match=f"1 runs are not finished in .*{names[2]}"):
-        finished_runs(SMOKE, elsewhere, reuse=[tmp_path / "made"], rerun=["gac"])
+        finished_runs(SMOKE, elsewhere, reuse=[made], rerun=["gac"])
 
 
-def test_launch_leaves_out_what_earlier_results_have(runs, tmp_path):
-    made = tmp_path / "made"
-    assert _program("benchmarks.aggregate", SMOKE, "--runs", runs, "--out", made).returncode == 0
-    command = ("benchmarks.launch", SMOKE, "--runs", tmp_path / "elsewhere", "--reuse-results", made)
-    assert "4 were finished before, 0 now, 0 failed." in _program(*command).stdout
+def test_launch_leaves_out_what_earlier_results_have(runs, made, tmp_path, program):
+    printed = program("benchmarks.launch", SMOKE, "--runs", tmp_path / "elsewhere", "--reuse-results", made)
+    assert "4 were finished before, 0 now, 0 failed." in printed
     jobs, finished = jobs_left(SMOKE, tmp_path / "elsewhere", [made], rerun=["gac"])
     assert finished == 2
     assert [job.spec.algorithm for job in jobs] == ["gac", "gac"]
@@ -213,13 +229,12 @@ def test_hours_are_those_of_the_runs_that_were_timed(runs):
 
 
 @pytest.mark.parametrize("change", [{"overrides": {"tau": 0.02}}, {"eval_episodes": 3}])
-def test_earlier_runs_with_other_settings_do_not_count(runs, tmp_path, change):
-    assert _program("benchmarks.aggregate", SMOKE, "--runs", runs, "--out", tmp_path / "made").returncode == 0
+def test_earlier_runs_with_other_settings_do_not_count(made, tmp_path, change):
     suite = yaml.safe_load(SMOKE.read_text()) | change
     path = tmp_path / "changed.yml"
     path.write_text(yaml.safe_dump(suite))
     with pytest.raises(FileNotFoundError, match="4 runs are not finished"):
-        finished_runs(path, tmp_path, reuse=[tmp_path / "made"])
+        finished_runs(path, tmp_path, reuse=[made])
 
 
 def test_results_that_do_not_name_their_runs_are_refused(tmp_path):
@@ -228,16 +243,15 @@ def test_results_that_do_not_name_their_runs_are_refused(tmp_path):
         finished_runs(SMOKE, tmp_path, reuse=[tmp_path / "old"])
 
 
-def test_a_failing_run_is_named_with_its_log(tmp_path):
+def test_a_failing_run_is_named_with_its_log(tmp_path, program):
     suite = yaml.safe_load(SMOKE.read_text())
     suite["cells"] = [{"task": "InvertedDoublePendulum", "noises": [0.1], "algorithms": ["gac"], "seeds": [0]}]
     suite["overrides"]["tau"] = 2
     path = tmp_path / "broken.yml"
     path.write_text(yaml.safe_dump(suite))
-    result = _program("benchmarks.launch", path, "--runs", tmp_path, "--retries", 1)
-    assert result.returncode == 1
+    printed = program("benchmarks.launch", path, "--runs", tmp_path, "--retries", 1, fails=True)
     log = tmp_path / "small-600" / "InvertedDoublePendulum-noise0.1" / "gac" / "seed0" / "log.txt"
-    assert f"FAILED, see {log}" in result.stdout.replace("\n", "")
+    assert f"FAILED, see {log}" in printed.replace("\n", "")
     assert "tau must be a number from 0 to 1, got 2" in log.read_text()
     assert log.read_text().count("--- attempt") == 2
 
@@ -477,7 +491,7 @@ def test_every_algorithm_fits_every_preset():
             algorithm_class(env=env, **settings | small)
 
 
-KILLS = 10  # of each program
+KILLS = 5  # of each program, spread over what it does
 
 
 @pytest.mark.parametrize("program", ["benchmarks.run", "benchmarks.launch"])
@@ -486,11 +500,12 @@ def test_what_is_killed_at_any_moment_is_finished_by_the_same_command(runs, tmp_
     specs = read_suite(SMOKE)[:1] if program == "benchmarks.run" else read_suite(SMOKE)
     arguments = ["--suite", SMOKE, "--index", 0] if program == "benchmarks.run" else [SMOKE, "--jobs", 2]
     command = [sys.executable, "-m", program, *map(str, arguments), "--runs", str(tmp_path)]
-    generator, kills = np.random.default_rng(0), 0
+    moments = itertools.cycle(np.random.default_rng(0).permutation(np.linspace(3.0, 10.0, KILLS)))
+    kills = 0
     while kills < KILLS:
         process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
-            assert process.wait(generator.uniform(3.0, 10.0)) == 0
+            assert process.wait(next(moments)) == 0
             _assert_finished_as(specs, tmp_path, runs)
             shutil.rmtree(tmp_path / "small-600")  # and from the start again
         except subprocess.TimeoutExpired:

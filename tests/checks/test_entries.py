@@ -10,10 +10,11 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, OnnxPolicy, export_learner
+from sb3_gac import GAC, AsymmetricSAC, OnnxPolicy, export_learner
 from sb3_gac.checks.entries import computable
 from sb3_gac.networks.encoders import EntryExtractor, module_names
 from tests.helpers import Sampled, TwoViewBandit, small_model
+from tests.registry import classes
 
 VECTOR = spaces.Box(-1, 1, (2,), np.float32)
 IMAGE = spaces.Box(0, 255, (36, 37, 3), np.uint8)
@@ -38,7 +39,7 @@ KINDS = {
 }
 ALL = spaces.Dict(partial=VECTOR, privileged=VECTOR, **{name.replace(" ", "_"): space for name, space in KINDS.items()})
 READS_ALL = [key for key in ALL.spaces if key != "privileged"]
-ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
+ALGORITHMS = classes("replay", "memory")
 
 
 def _numbers(space, value):
@@ -56,7 +57,7 @@ def _features(observation, row):
 
 
 def _model(cls=GAC, cell="", **arguments):
-    roles = {"learner" if cls is not AsymmetricSAC else "actor": READS_ALL}
+    roles = {cls.policy_aliases["MultiInputPolicy"].roles.deployed: READS_ALL}
     options = {"policy": f"MultiInput{cell}Policy", "buffer_size": 60, "batch_size": 4, "role_keys": roles}
     if cell:
         options["policy_kwargs"] = {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8]}
@@ -203,7 +204,7 @@ REFUSED = {
 def test_other_kinds_are_refused_by_name(kind, cls):
     space, message = REFUSED[kind]
     with pytest.raises(ValueError, match=f'entry "odd one" can\'t be learned from: {message}'):
-        small_model(Sampled(spaces.Dict({"partial": VECTOR, "odd one": space})), cls)
+        small_model(Sampled(spaces.Dict({"partial": VECTOR, "odd one": space})), cls, **dict.fromkeys(cls.frozen_arguments))
 
 
 @pytest.mark.parametrize("name", ["", 3])

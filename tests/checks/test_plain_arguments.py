@@ -11,12 +11,13 @@ import pytest
 import torch as th
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import GAC, AsymmetricSAC
 from sb3_gac.checks.arguments import PlainSchedule, constructor_arguments
 from sb3_gac.checks.values import plain
 from tests.helpers import Recall, TwoViewBandit, optimizers_of, small_model
+from tests.registry import classes
 
-ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
+ALGORITHMS = classes("replay", "temperature")
 Pair = namedtuple("Pair", "low high")
 
 
@@ -122,7 +123,7 @@ GACS_OWN = {
 
 @pytest.mark.parametrize("cls", ALGORITHMS)
 def test_a_model_made_with_foreign_numbers_is_saved_loaded_and_resumed(cls, tmp_path):
-    arguments = SHARED if cls is AsymmetricSAC else SHARED | GACS_OWN
+    arguments = SHARED | (GACS_OWN if issubclass(cls, GAC) else {})
     model = small_model(cls=cls, **arguments).learn(20)
     assert model._n_updates > 0
     for argument in constructor_arguments(cls):

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from contextlib import nullcontext
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -16,11 +17,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_gac
-from sb3_gac import GAC, AsymmetricMPO, AsymmetricSAC, DeploymentNormalizer, OnnxPolicy, export_learner
+from sb3_gac import GAC, DeploymentNormalizer, OnnxPolicy, export_learner
 from sb3_gac.deploy.verification import ExportError, draw_observations
 from sb3_gac.envs import History
 from sb3_gac.networks.encoders import VectorExtractor
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model, unlike_each_other
+from tests.registry import LINES, make
 from tests.sb3_contract.helpers import Renamed
 
 VECTOR = spaces.Box(-1, 1, (2,), np.float32)
@@ -52,17 +54,16 @@ def _recurrent(cell, env, **policy_kwargs):
 
 
 KINDS = {
-    "plain": lambda: small_model(TwoViewBandit(length=5)),
+    **{name: partial(make, name, TwoViewBandit(length=5)) for name, line in LINES.items() if not line.remembers},
     "ranges": lambda: small_model(Scaled()),
     "discrete": lambda: small_model(TwoViewChoice(length=5)),
-    "asymmetric": lambda: small_model(TwoViewBandit(length=5), cls=AsymmetricSAC),
-    "asymmetric MPO": lambda: small_model(Scaled(), cls=AsymmetricMPO),
     "normalised": lambda: small_model(_normalised()),
     "image": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN),
     "image, shared encoder": lambda: small_model(Sampled(IMAGE), policy_kwargs=CNN | SHARED),
     "history": lambda: small_model(History(Sampled(SEVERAL), 3, actions=True), role_keys=READS_TWO),
 }
 WITH_MEMORY = {
+    **{name: partial(make, name, TwoViewBandit(length=5)) for name, line in LINES.items() if line.remembers},
     "recurrent": lambda: _recurrent("Gru", Recall()),
     "recurrent, continuous": lambda: _recurrent("Lstm", Recall(continuous=True)),
     "recurrent, normalised": lambda: _recurrent("Lstm", _normalised()),
@@ -94,7 +95,7 @@ def _drawn(model, n, seed):
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
     """On 10,000 observations, to 1e-5 or, if discrete, but for ties; with VecNormalize, from raw observations."""
-    model = KINDS[kind]().learn(60)
+    model = KINDS[kind]().learn(40)
     path = export_learner(model, tmp_path / f"learner{suffix}")
     raw = _drawn(model, 10_000, seed=1)
     expected, _ = model.predict(_normalised_as_in_training(model, raw), deterministic=True)
@@ -118,7 +119,7 @@ def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
 def test_a_memory_is_carried_and_reset(kind, tmp_path):
     """500 sequences of 20 observations, twice."""
     model = WITH_MEMORY[kind]().learn(60)
-    unlike_each_other(model.policy, scale=0.2 if "image" in kind else 1.0)
+    unlike_each_other(model.policy, scale=0.2 if "image" in kind or kind in LINES else 1.0)
     learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx"))
     script = th.jit.load(str(export_learner(model, tmp_path / "learner.pt")))
     sequence = [_drawn(model, 500, seed=step) for step in range(20)]
@@ -220,7 +221,7 @@ def test_a_memory_that_is_not_carried_on_is_noticed(tmp_path, monkeypatch):
         export_learner(model, tmp_path / "learner.onnx")
 
 
-@pytest.mark.parametrize("kind", ["plain", "ranges"])
+@pytest.mark.parametrize("kind", ["gac", "ranges"])
 @pytest.mark.parametrize(("error", "is_written"), [(1e-4, False), (2e-6, True)])
 def test_how_much_actions_may_differ(kind, error, is_written, tmp_path, monkeypatch):
     """In units of half their range."""

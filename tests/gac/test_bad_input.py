@@ -9,10 +9,11 @@ from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ, InvalidStepError, OnnxPolicy, export_learner
+from sb3_gac import GAC, GACShare, GACWithoutQ, InvalidStepError, OnnxPolicy, export_learner
 from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
+from tests.registry import classes
 
-ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
+ALGORITHMS = classes("replay")
 
 
 class _Poisoned(TwoViewBandit):
@@ -117,7 +118,6 @@ BOUNDS = {
     "several faults": (_box([0, -np.inf], [0, 1]), "component 1 is not bounded .*; component 0 is locked"),
     "nothing": (spaces.Box(-1, 1, (0,), np.float32), "has no component"),
 }
-ALGORITHMS = [GAC, GACShare, GACWithoutQ, AsymmetricSAC]
 
 
 @pytest.mark.parametrize("cls", ALGORITHMS)
@@ -126,7 +126,7 @@ def test_bounds_that_actions_cannot_be_scaled_to_are_named(fault, cls):
     space, message = BOUNDS[fault]
     for error in (ValueError, AssertionError):
         with pytest.raises(error, match=message):
-            small_model(_Acting(space), cls)
+            small_model(_Acting(space), cls, **dict.fromkeys(cls.frozen_arguments))
 
 
 def test_a_vectorised_environment_or_another_one_is_refused_alike():
@@ -319,7 +319,7 @@ def test_a_guider_of_one_entry_still_needs_what_its_learner_reads():
 @pytest.mark.parametrize("cls", ALGORITHMS)
 @pytest.mark.parametrize("keys", [["priviledged"], "privileged", []])
 def test_role_keys_are_named_as_they_were_written(cls, keys):
-    roles = ["critic", *cls.policy_aliases["MultiInputPolicy"].roles.all]
+    roles = ["critic", *cls.policy_aliases["MultiInputPolicy"].roles.networks]
     for role in roles:
         with pytest.raises(ValueError, match=rf'^role_keys\["{role}"\]'):
             small_model(cls=cls, role_keys={role: keys})

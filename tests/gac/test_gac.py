@@ -112,18 +112,18 @@ def test_target_kl_may_shrink_over_training():
 @pytest.mark.parametrize(
     ("cls", "arguments", "steps"),
     [
-        (GAC, {}, 1500),
-        (GAC, {"learner_entropy": False}, 1500),
-        (GAC, {"guider": "independent", "max_kl": 0.02}, 1500),
-        (GACShare, {}, 1500),
-        (GACWithoutQ, {"guider": "independent", "target_kl": 0.3, "learning_rate": 1e-3}, 3000),
+        (GAC, {}, 700),
+        (GAC, {"learner_entropy": False, "learning_rate": 5e-3}, 1000),
+        (GAC, {"guider": "independent", "max_kl": 0.02}, 700),
+        (GACShare, {}, 700),
+        (GACWithoutQ, {"guider": "independent", "target_kl": 0.3, "learning_rate": 3e-3}, 1500),
     ],
     ids=["GAC", "as printed", "independent", "GACShare", "GACWithoutQ"],
 )
 def test_learner_reaches_the_known_optimum(cls, arguments, steps):
     """The target is in the partial view; random actions are 0.6 away from it on average."""
-    arguments = {"learning_rate": 3e-3, **arguments}
-    model = small_model(TwoViewBandit(), cls, batch_size=64, learning_starts=200, **arguments)
+    arguments = {"learning_rate": 1e-2, "tau": 0.02, **arguments}
+    model = small_model(TwoViewBandit(), cls, batch_size=64, learning_starts=100, **arguments)
     model.learn(steps)
     targets = np.linspace(-0.7, 0.7, 15, dtype=np.float32)
     partial = np.stack([targets, np.zeros_like(targets)], axis=1)
@@ -133,8 +133,8 @@ def test_learner_reaches_the_known_optimum(cls, arguments, steps):
 
 def test_learner_averages_over_what_it_cannot_see():
     """Through noise the best action is the posterior mean, well inside the target's range; the guider sees the target."""
-    model = small_model(TwoViewBandit(noise_std=0.5), learning_rate=3e-3, batch_size=64, learning_starts=200)
-    model.learn(2500)
+    model = small_model(TwoViewBandit(noise_std=0.5), learning_rate=5e-3, tau=0.02, batch_size=64, learning_starts=100)
+    model.learn(1000)
     noise, targets = np.linspace(-1.2, 1.2, 9), np.linspace(-0.8, 0.8, 2001)
     likelihood = np.exp(-0.5 * ((noise[:, None] - targets) / 0.5) ** 2)
     posterior_mean = (likelihood * targets).sum(axis=1) / likelihood.sum(axis=1)
@@ -145,7 +145,8 @@ def test_learner_averages_over_what_it_cannot_see():
 
 
 def test_kl_settles_at_its_target():
-    model = small_model(TwoViewBandit(noise_std=0.5), learning_rate=1e-3, batch_size=64, learning_starts=100, target_kl=0.02)
+    rates = {"learning_rate": 3e-3, "kl_coef_learning_rate": 5e-3}
+    model = small_model(TwoViewBandit(noise_std=0.5), batch_size=64, learning_starts=100, target_kl=0.02, **rates)
     kls = []
     original = model.update
 
@@ -155,8 +156,8 @@ def test_kl_settles_at_its_target():
         return metrics
 
     model.update = spy
-    model.learn(2500)
-    assert np.mean(kls[-500:]) == pytest.approx(0.02, rel=0.25)
+    model.learn(1200)
+    assert np.mean(kls[-400:]) == pytest.approx(0.02, rel=0.25)
 
 
 @pytest.mark.parametrize("truncate", [True, False])
@@ -174,8 +175,8 @@ def test_time_limits_bootstrap_and_terminations_do_not(truncate):
         def step(self, action):
             return self.reset()[0], 1.0, not truncate, truncate, {}
 
-    model = small_model(OneStep(), gamma=0.8, tau=0.1, ent_coef=0.0, kl_coef=0.0, learning_rate=3e-3, batch_size=32)
-    model.learn(1200)
+    model = small_model(OneStep(), gamma=0.8, tau=0.3, ent_coef=0.0, kl_coef=0.0, learning_rate=1e-2, batch_size=32)
+    model.learn(400)
     obs = {key: th.zeros(1, 1) for key in ("partial", "privileged")}
     expected = 5.0 if truncate else 1.0
     for critic in (model.policy.guider_critic, model.policy.learner_critic):

@@ -33,12 +33,13 @@ def test_the_deployed_policy_remembers_what_it_saw(cls):
         cls,
         learning_starts=200,
         batch_size=32,
-        learning_rate=3e-3,
+        learning_rate=1e-2,
         ent_coef=0.02,
-        tau=0.02,
+        tau=0.05,
         gamma=0.9,
+        train_freq=2,
         policy_kwargs={"net_arch": [16], "rnn_hidden_size": 16, "rnn_net_arch": [16]},
-    ).learn(2000)
+    ).learn(1200)
     returns, _ = evaluate_policy(model, make_vec_env(Recall, 1, seed=1), n_eval_episodes=60, warn=False)
     assert returns > 0.9
 

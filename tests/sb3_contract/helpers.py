@@ -1,4 +1,4 @@
-"""SB3's test environments with Dict observations, and GAC small enough to test with them."""
+"""SB3's test environments with Dict observations."""
 
 from typing import Any
 
@@ -8,7 +8,6 @@ from gymnasium import spaces
 from stable_baselines3.common.envs import IdentityEnvBox
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_gac import GAC
 from sb3_gac.envs import PARTIAL, PRIVILEGED, SplitObservation
 
 
@@ -101,14 +100,6 @@ def identity(low: float = -10, high: float = 10, eps: float = 0.05) -> gym.Env:
 def vectorized(make_env=identity, n_envs: int = 1) -> VecEnv:
     """``n_envs`` environments in this process."""
     return DummyVecEnv([make_env] * n_envs)
-
-
-def make_gac(env: Any = None, model_class: type[GAC] = GAC, **kwargs: Any) -> GAC:
-    """GAC with small networks that trains after 20 steps, on Pendulum, unless told otherwise."""
-    defaults = {"buffer_size": 1000, "learning_starts": 20, "batch_size": 32}
-    policy_kwargs = {"net_arch": [16], **kwargs.pop("policy_kwargs", {})}
-    env = pendulum() if env is None else env
-    return model_class("MultiInputPolicy", env, policy_kwargs=policy_kwargs, **{**defaults, **kwargs})
 
 
 def sample_observations(env: VecEnv, n_steps: int = 10) -> dict[str, np.ndarray]:

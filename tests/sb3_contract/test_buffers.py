@@ -7,7 +7,8 @@ import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer
 
 from sb3_gac import CompactDictReplayBuffer
-from tests.sb3_contract.helpers import make_gac, pendulum, vectorized
+from tests.registry import algorithms, make
+from tests.sb3_contract.helpers import pendulum, vectorized
 
 
 class OwnBuffer(DictReplayBuffer):
@@ -23,32 +24,45 @@ class OwnBuffer(DictReplayBuffer):
         return super().sample(batch_size, env)._replace(discounts=th.full((batch_size, 1), 0.5))
 
 
-@pytest.mark.parametrize("buffer_class", [None, DictReplayBuffer])
-def test_default_buffer_and_sb3s(buffer_class):
-    model = make_gac(vectorized(pendulum, 2), buffer_size=50, replay_buffer_class=buffer_class)
-    assert type(model.replay_buffer) is (buffer_class or CompactDictReplayBuffer)
-    assert model.replay_buffer.buffer_size == 25
-    model.learn(80)
+def _check_buffer(algorithm, buffer_class, **arguments):
+    model = make(algorithm, vectorized(pendulum, 2), buffer_size=30, **arguments)
+    assert type(model.replay_buffer) is buffer_class
+    assert model.replay_buffer.buffer_size == 15
+    model.learn(40)
     assert model.replay_buffer.full
 
 
-def test_buffer_of_ones_own_is_sampled():
-    model = make_gac(replay_buffer_class=OwnBuffer, replay_buffer_kwargs={"scale": 2.0}, batch_size=7).learn(30)
+@algorithms("replay")
+def test_default_buffer(algorithm):
+    _check_buffer(algorithm, CompactDictReplayBuffer)
+
+
+@algorithms("replay", "other buffers")
+def test_sb3s_buffer(algorithm):
+    _check_buffer(algorithm, DictReplayBuffer, replay_buffer_class=DictReplayBuffer)
+
+
+@algorithms("replay", "other buffers")
+def test_buffer_of_ones_own_is_sampled(algorithm):
+    own = {"replay_buffer_class": OwnBuffer, "replay_buffer_kwargs": {"scale": 2.0}}
+    model = make(algorithm, pendulum(), batch_size=7, **own).learn(30)
     assert model.replay_buffer.scale == 2.0
     assert model.replay_buffer.n_samples == 7 * model._n_updates > 0
     assert model._sample_batch(7).discounts.tolist() == [0.5] * 7
 
 
-def test_unknown_buffer_arguments_are_refused():
+@algorithms("replay")
+def test_unknown_buffer_arguments_are_refused(algorithm):
     with pytest.raises(TypeError, match="unexpected keyword argument 'wrong_keyword'"):
-        make_gac(replay_buffer_kwargs={"wrong_keyword": 1})
+        make(algorithm, pendulum(), replay_buffer_kwargs={"wrong_keyword": 1})
 
 
 @pytest.mark.parametrize("handle_timeouts", [True, False])
-def test_time_limits_are_not_terminations(handle_timeouts):
+@algorithms("replay")
+def test_time_limits_are_not_terminations(algorithm, handle_timeouts):
     env = gym.wrappers.TimeLimit(pendulum(), 10)
     kwargs = {"handle_timeout_termination": handle_timeouts}
-    model = make_gac(env, learning_starts=100, batch_size=200, replay_buffer_kwargs=kwargs).learn(50)
+    model = make(algorithm, env, learning_starts=100, batch_size=200, replay_buffer_kwargs=kwargs).learn(50)
     assert model.replay_buffer.dones[:50].sum() == 5
     assert (model._sample_batch(200).dones.sum() == 0) == handle_timeouts
 
@@ -61,11 +75,12 @@ class _Recorder(gym.Wrapper):
         return super().step(action)
 
 
-def test_stored_transitions_chain_and_actions_are_scaled():
+@algorithms("replay")
+def test_stored_transitions_chain_and_actions_are_scaled(algorithm):
     env = _Recorder(pendulum())
-    buffer = make_gac(env, learning_starts=10, buffer_size=100).learn(60).replay_buffer
+    buffer = make(algorithm, env, buffer_size=100).learn(40).replay_buffer
     for key, value in buffer.observations.items():
-        np.testing.assert_array_equal(value[1:60], buffer.next_observations[key][:59])
-    assert np.abs(buffer.actions[:60]).max() <= 1
+        np.testing.assert_array_equal(value[1:40], buffer.next_observations[key][:39])
+    assert np.abs(buffer.actions[:40]).max() <= 1
     # Scaling adds and takes away 1, so a small action is exact to float32's step at 1, not to its own.
-    np.testing.assert_allclose(env.actions, 2 * buffer.actions[:60, 0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(env.actions, 2 * buffer.actions[:40, 0], rtol=0, atol=1e-6)

@@ -17,59 +17,61 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC
-from tests.sb3_contract.helpers import identity, make_gac, pendulum, vectorized
+from tests.registry import algorithms, load, make, on_policy
+from tests.sb3_contract.helpers import identity, pendulum, vectorized
 
 
 def _short_pendulum():
-    return pendulum(max_episode_steps=20)
+    return pendulum(max_episode_steps=10)
 
 
-def test_callbacks_of_every_kind(tmp_path):
-    model = make_gac(_short_pendulum())
-    checkpoint = CheckpointCallback(save_freq=50, save_path=tmp_path)
+@algorithms()
+def test_callbacks_of_every_kind(algorithm, tmp_path):
+    model = make(algorithm, _short_pendulum())
+    checkpoint = CheckpointCallback(save_freq=25, save_path=tmp_path)
     evaluation = EvalCallback(
         _short_pendulum(),
         callback_on_new_best=StopTrainingOnRewardThreshold(reward_threshold=1.0),
         callback_after_eval=StopTrainingOnNoModelImprovement(max_no_improvement_evals=100, min_evals=1),
         best_model_save_path=tmp_path,
         log_path=tmp_path,
-        eval_freq=32,
+        eval_freq=16,
+        n_eval_episodes=2,
         warn=False,
     )
     on_event = CheckpointCallback(save_freq=1, save_path=tmp_path, name_prefix="event")
-    event = EveryNTimesteps(n_steps=60, callback=on_event)
+    event = EveryNTimesteps(n_steps=30, callback=on_event)
     max_episodes = StopTrainingOnMaxEpisodes(max_episodes=100)
-    callback = CallbackList([checkpoint, evaluation, event, LogEveryNTimesteps(n_steps=64), max_episodes])
-    model.learn(100, callback=callback)
+    callback = CallbackList([checkpoint, evaluation, event, LogEveryNTimesteps(n_steps=32), max_episodes])
+    model.learn(50, callback=callback)
 
     assert model.env.observation_space.contains({key: value[0] for key, value in callback.locals["new_obs"].items()})
     for child in (checkpoint, event, on_event):
         assert child.locals["new_obs"] is callback.locals["new_obs"]
-    assert event.num_timesteps == event.n_calls == model.num_timesteps == 100
-    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [32, 64, 96]
+    assert event.num_timesteps == event.n_calls == model.num_timesteps == 50
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [16, 32, 48]
     obs = model.get_env().reset()
-    for name in ("rl_model_50_steps", "rl_model_100_steps", "event_60_steps", "best_model"):
-        assert GAC.load(tmp_path / name).predict(obs)[0].shape == (1, 1)
+    for name in ("rl_model_25_steps", "rl_model_50_steps", "event_30_steps", "best_model"):
+        assert load(algorithm, tmp_path / name).predict(obs)[0].shape == (1, 1)
 
-    model.learn(40, callback=None)
-    model.learn(40, callback=[checkpoint, evaluation], progress_bar=True)
-    model.learn(40, callback=lambda _locals, _globals: True)
-    assert model.num_timesteps == 40
-
-
-@pytest.mark.parametrize(("threshold", "n_steps"), [(-1e6, 32), (1.0, 100)])
-def test_a_good_evaluation_stops_training(threshold, n_steps):
-    stop = StopTrainingOnRewardThreshold(reward_threshold=threshold)
-    model = make_gac(_short_pendulum(), train_freq=1)
-    model.learn(100, callback=EvalCallback(_short_pendulum(), callback_on_new_best=stop, eval_freq=32, warn=False))
-    assert model.num_timesteps == n_steps
+    model.learn(20, callback=[checkpoint, evaluation], progress_bar=True)
+    model.learn(20, callback=lambda _locals, _globals: True)
+    assert model.num_timesteps == 20
 
 
-def test_no_improvement_stops_training():
+@algorithms()
+def test_a_good_evaluation_stops_training(algorithm):
+    """One that is not good enough does not: above."""
+    stop = StopTrainingOnRewardThreshold(reward_threshold=-1e6)
+    evaluation = EvalCallback(_short_pendulum(), callback_on_new_best=stop, eval_freq=13, n_eval_episodes=1, warn=False)
+    assert make(algorithm, _short_pendulum()).learn(50, callback=evaluation).num_timesteps == 13
+
+
+@algorithms()
+def test_no_improvement_stops_training(algorithm):
     stop = StopTrainingOnNoModelImprovement(max_no_improvement_evals=1, min_evals=0)
     always_right = identity(-1, 1, eps=10)  # so that no evaluation is better than the first
-    model = make_gac(identity(-1, 1), gradient_steps=0)
+    model = make(algorithm, identity(-1, 1))
     evaluation = EvalCallback(always_right, callback_after_eval=stop, eval_freq=10, n_eval_episodes=1, warn=False)
     model.learn(100, callback=evaluation)
     assert evaluation.last_mean_reward == 100
@@ -77,10 +79,11 @@ def test_no_improvement_stops_training():
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_max_episodes_stop_training(n_envs):
-    model = make_gac(vectorized(_short_pendulum, n_envs), train_freq=1)
+@algorithms()
+def test_max_episodes_stop_training(algorithm, n_envs):
+    model = make(algorithm, vectorized(_short_pendulum, n_envs))
     model.learn(500, callback=StopTrainingOnMaxEpisodes(max_episodes=2))
-    assert model.num_timesteps == 2 * 20 * n_envs
+    assert model.num_timesteps == 2 * 10 * n_envs
 
 
 class _Cancel(BaseCallback):
@@ -92,48 +95,57 @@ class _Cancel(BaseCallback):
         return self.value
 
 
-@pytest.mark.parametrize("value", [False, np.bool_(0), th.tensor(0, dtype=th.bool)])
-def test_callbacks_cancel_runs(value):
-    callback = _Cancel(value)
-    make_gac(learning_starts=1, buffer_size=1, batch_size=1).learn(10, callback=callback)
-    assert callback.n_calls == 1
+@algorithms()
+def test_callbacks_cancel_runs(algorithm):
+    model = make(algorithm, pendulum())
+    for value in (False, np.bool_(0), th.tensor(0, dtype=th.bool)):
+        callback = _Cancel(value)
+        model.learn(10, callback=callback)
+        assert callback.n_calls == 1
 
 
-def test_evaluation_on_several_environments():
-    evaluation = EvalCallback(vectorized(lambda: identity(-1, 1, eps=10), n_envs=3), eval_freq=30, warn=False)
-    make_gac(identity(-1, 1)).learn(60, callback=evaluation)
+@algorithms()
+def test_evaluation_on_several_environments(algorithm):
+    several = vectorized(lambda: identity(-1, 1, eps=10), n_envs=3)
+    evaluation = EvalCallback(several, eval_freq=10, n_eval_episodes=3, warn=False)
+    make(algorithm, identity(-1, 1)).learn(10, callback=evaluation)
     assert evaluation.last_mean_reward == 100.0
 
 
-def test_evaluation_synchronizes_vec_normalize_and_refuses_other_environments():
+@algorithms()
+def test_evaluation_synchronizes_vec_normalize_and_refuses_other_environments(algorithm):
     train_env = VecNormalize(vectorized(_short_pendulum))
     eval_env = VecNormalize(vectorized(_short_pendulum), training=False, norm_reward=False)
     train_env.reset()
     original_obs = train_env.get_original_obs()
-    model = make_gac(train_env)
-    model.learn(50, callback=EvalCallback(eval_env, eval_freq=50, warn=False))
+    model = make(algorithm, train_env)
+    model.learn(20, callback=EvalCallback(eval_env, eval_freq=20, warn=False))
     normalized = eval_env.normalize_obs(original_obs)
     for key, value in train_env.normalize_obs(original_obs).items():
         np.testing.assert_allclose(value, normalized[key])
         assert not np.allclose(value, original_obs[key])
     with pytest.warns(UserWarning, match="not of the same type"), pytest.raises(AssertionError, match="VecEnvWrapper"):
-        model.learn(50, callback=EvalCallback(_short_pendulum(), eval_freq=20, warn=False))
+        model.learn(20, callback=EvalCallback(_short_pendulum(), eval_freq=10, warn=False))
 
 
-def test_checkpoints_hold_replay_buffer_and_vec_normalize(tmp_path):
+@algorithms()
+def test_checkpoints_hold_replay_buffer_and_vec_normalize(algorithm, tmp_path):
     vec_env = DummyVecEnv([_short_pendulum])
-    model = make_gac(VecNormalize(vec_env))
-    callback = CheckpointCallback(save_freq=40, save_path=tmp_path, save_replay_buffer=True, save_vecnormalize=True)
-    model.learn(40, callback=callback)
-    env = VecNormalize.load(str(tmp_path / "rl_model_vecnormalize_40_steps.pkl"), vec_env)
-    loaded = GAC.load(tmp_path / "rl_model_40_steps.zip", env=env)
-    loaded.load_replay_buffer(tmp_path / "rl_model_replay_buffer_40_steps.pkl")
-    loaded.learn(40, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 80
-    assert loaded.replay_buffer.pos == 80  # with the step that the checkpoint was written after
+    model = make(algorithm, VecNormalize(vec_env))
+    callback = CheckpointCallback(save_freq=30, save_path=tmp_path, save_replay_buffer=True, save_vecnormalize=True)
+    model.learn(30, callback=callback)
+    env = VecNormalize.load(str(tmp_path / "rl_model_vecnormalize_30_steps.pkl"), vec_env)
+    loaded = load(algorithm, tmp_path / "rl_model_30_steps.zip", env=env)
+    if not on_policy(algorithm):
+        loaded.load_replay_buffer(tmp_path / "rl_model_replay_buffer_30_steps.pkl")
+    loaded.learn(20, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 50
+    if not on_policy(algorithm):
+        assert loaded.replay_buffer.pos == 50  # with the step that the checkpoint was written after
 
 
-def test_children_know_their_evaluation(tmp_path):
+@algorithms()
+def test_children_know_their_evaluation(algorithm, tmp_path):
     parents = []
 
     class Child(BaseCallback):
@@ -142,13 +154,13 @@ def test_children_know_their_evaluation(tmp_path):
             return True
 
     evaluation = EvalCallback(
-        gym.wrappers.TimeLimit(_short_pendulum(), 10),
+        gym.wrappers.TimeLimit(_short_pendulum(), 5),
         best_model_save_path=tmp_path,
-        eval_freq=32,
+        eval_freq=10,
         callback_on_new_best=CallbackList([Child()]),
         callback_after_eval=CallbackList([Child()]),
         warn=False,
     )
-    make_gac().learn(32, callback=evaluation)
+    make(algorithm, pendulum()).learn(10, callback=evaluation)
     assert len(parents) == 2
     assert (tmp_path / "best_model.zip").exists()

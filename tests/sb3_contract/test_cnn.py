@@ -7,9 +7,9 @@ from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 
-from sb3_gac import GAC
 from sb3_gac.envs import PARTIAL, PRIVILEGED
-from tests.sb3_contract.helpers import AsDict, make_gac
+from tests.registry import algorithms, load, make
+from tests.sb3_contract.helpers import AsDict
 
 
 def _env(entries=(PARTIAL,), channel_first=False):
@@ -17,9 +17,9 @@ def _env(entries=(PARTIAL,), channel_first=False):
     return AsDict(image_env, entries)
 
 
-def _make(env, policy_kwargs=None, **kwargs):
+def _make(algorithm, env, policy_kwargs=None, **kwargs):
     extractor = {"features_extractor_kwargs": {"cnn_output_dim": 8}, **(policy_kwargs or {})}
-    return make_gac(env, policy_kwargs=extractor, **{"buffer_size": 100, "seed": 0, "train_freq": 8, **kwargs})
+    return make(algorithm, env, policy_kwargs=extractor, **{"batch_size": 4, "seed": 0, **kwargs})
 
 
 def _clone(module):
@@ -34,31 +34,41 @@ def _assert_all_differ(parameters, others):
     assert not any(th.allclose(one, other) for one, other in zip(parameters, others, strict=True))
 
 
-@pytest.mark.parametrize("entries", [(PARTIAL,), (PRIVILEGED,), (PARTIAL, PRIVILEGED)])
-def test_images_are_transposed_learned_from_and_saved(tmp_path, entries):
+def _check_learns_from_images(algorithm, entries, path):
     env = _env(entries)
-    model = _make(env).learn(60)
+    model = _make(algorithm, env).learn(20)
     assert is_vecenv_wrapped(model.get_env(), VecTransposeImage)
     obs, _ = env.reset()
     assert len({model.predict(obs, deterministic=False)[0].tobytes() for _ in range(5)}) == 5
     action, _ = model.predict(obs, deterministic=True)
     assert env.action_space.contains(action)
-    model.save(tmp_path / "model.zip")
-    loaded = GAC.load(tmp_path / "model.zip")
+    model.save(path)
+    loaded = load(algorithm, path)
     for observation in (obs, {PARTIAL: obs[PARTIAL]}):
         np.testing.assert_allclose(action, loaded.predict(observation, deterministic=True)[0])
 
 
-def test_channel_first_images_are_not_transposed():
+@algorithms()
+def test_images_are_transposed_learned_from_and_saved(algorithm, tmp_path):
+    _check_learns_from_images(algorithm, (PARTIAL, PRIVILEGED), tmp_path / "model.zip")
+
+
+@pytest.mark.parametrize("entry", [PARTIAL, PRIVILEGED])
+def test_images_in_one_entry_are_transposed_learned_from_and_saved(entry, tmp_path):
+    _check_learns_from_images("gac", (entry,), tmp_path / "model.zip")
+
+
+@algorithms()
+def test_channel_first_images_are_not_transposed(algorithm):
     env = _env(channel_first=True)
-    model = _make(env).learn(30)
+    model = _make(algorithm, env)
     assert not is_vecenv_wrapped(model.get_env(), VecTransposeImage)
     assert model.predict(env.reset()[0])[0].shape == (5,)
 
 
 def test_targets_of_features_extractors():
     # Warm up without a gradient step
-    model = _make(_env((PARTIAL, PRIVILEGED)), learning_rate=1e-3, learning_starts=50, tau=0.0).learn(16)
+    model = _make("gac", _env((PARTIAL, PRIVILEGED)), learning_rate=1e-3, learning_starts=50, tau=0.0).learn(16)
     policy = model.policy
     roles = ("learner", "guider", "guider_critic", "learner_critic")
     assert len({id(getattr(policy, role).features_extractor) for role in roles}) == 4
@@ -85,18 +95,20 @@ def test_targets_of_features_extractors():
 
 
 @pytest.mark.parametrize("normalize_images", [True, False])
-def test_image_like_floats_are_images_where_they_are_not_normalized_again(normalize_images):
+@algorithms()
+def test_image_like_floats_are_images_where_they_are_not_normalized_again(algorithm, normalize_images):
     env = VecNormalize(DummyVecEnv([lambda: _env(channel_first=True)]))
-    model = _make(env, policy_kwargs={"normalize_images": normalize_images}).learn(30)
-    assert model._n_updates > 0
-    for network in (model.policy.learner, model.policy.guider, model.critic, model.policy.guider_critic):
-        is_image = isinstance(network.features_extractor.extractors[PARTIAL], NatureCNN)
-        assert is_image == (not normalize_images)
+    model = _make(algorithm, env, policy_kwargs={"normalize_images": normalize_images})
+    deployed = model.policy.deployed.features_extractor.extractors[PARTIAL]
+    assert isinstance(deployed, NatureCNN) == (not normalize_images)
+    convolutions = [module for module in model.policy.modules() if isinstance(module, NatureCNN)]
+    assert bool(convolutions) == (not normalize_images)
+    assert model.learn(20)._n_updates > 0
 
 
 @pytest.mark.parametrize("normalize_images", [True, False])
 def test_images_are_divided_by_255_where_asked(normalize_images):
-    model = _make(_env(), policy_kwargs={"normalize_images": normalize_images})
+    model = _make("gac", _env(), policy_kwargs={"normalize_images": normalize_images})
     seen = []
     for network in (model.policy.learner, model.policy.guider, model.critic, model.critic_target):
         network.features_extractor.register_forward_pre_hook(lambda _, args: seen.append(args[0][PARTIAL].max().item()))

@@ -9,9 +9,10 @@ from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_gac import GAC, GACPolicy
+from sb3_gac.algorithms import algorithm_class
 from tests.helpers import optimizers_of
-from tests.sb3_contract.helpers import make_gac, pendulum
+from tests.registry import algorithms, load, make
+from tests.sb3_contract.helpers import pendulum
 
 
 def _hidden_sizes(network):
@@ -33,7 +34,7 @@ def _hidden_sizes(network):
     ],
 )
 def test_net_arch(net_arch, policy_sizes, critic_sizes):
-    model = make_gac(policy_kwargs={"net_arch": net_arch}, train_freq=2).learn(40)
+    model = make("gac", pendulum(), policy_kwargs={"net_arch": net_arch}).learn(20)
     assert model._n_updates > 0
     for network in (model.policy.learner, model.policy.guider):
         assert _hidden_sizes(network) == policy_sizes
@@ -41,10 +42,36 @@ def test_net_arch(net_arch, policy_sizes, critic_sizes):
         assert _hidden_sizes(critic) == _hidden_sizes(target) == critic_sizes
 
 
+@algorithms()
+def test_net_arch_of_policies_and_critics(algorithm):
+    model = make(algorithm, pendulum(), policy_kwargs={"net_arch": {"pi": [8, 4], "qf": [6]}}).learn(20)
+    assert model._n_updates > 0
+    assert _hidden_sizes(model.actor) == [8, 4]
+    critics = [network for role in model.policy.roles.critics for network in model.policy.pairs.get(role, ())]
+    assert all(_hidden_sizes(network) == [6] for network in critics)
+
+
 @pytest.mark.parametrize("net_arch", [{"pi": [8]}, {"vf": [8], "pi": [8]}])
-def test_unknown_net_arch_is_refused(net_arch):
+@algorithms()
+def test_unknown_net_arch_is_refused(algorithm, net_arch):
     with pytest.raises(ValueError, match="net_arch"):
-        make_gac(policy_kwargs={"net_arch": net_arch})
+        make(algorithm, pendulum(), policy_kwargs={"net_arch": net_arch})
+
+
+def _check_optimizers(algorithm, optimizer_class, optimizer_kwargs, path):
+    policy_kwargs = {"optimizer_class": optimizer_class, "optimizer_kwargs": optimizer_kwargs}
+    model = make(algorithm, pendulum(), policy_kwargs=policy_kwargs).learn(20)
+    model.save(path)
+    for one in (model, load(algorithm, path)):
+        for optimizer in optimizers_of(one.policy):
+            assert type(optimizer) is optimizer_class
+            for name, value in (optimizer_kwargs or {}).items():
+                assert optimizer.param_groups[0][name] == value
+
+
+@algorithms()
+def test_optimizer(algorithm, tmp_path):
+    _check_optimizers(algorithm, th.optim.SGD, {"momentum": 0.9}, tmp_path / "model")
 
 
 @pytest.mark.parametrize(
@@ -53,34 +80,29 @@ def test_unknown_net_arch_is_refused(net_arch):
         (th.optim.AdamW, None),
         (th.optim.AdamW, {"weight_decay": 0.0}),
         (th.optim.Adam, {"foreach": True}),
-        (th.optim.SGD, {"momentum": 0.9}),
         (RMSpropTFLike, None),
     ],
 )
-def test_optimizer(tmp_path, optimizer_class, optimizer_kwargs):
-    policy_kwargs = {"optimizer_class": optimizer_class, "optimizer_kwargs": optimizer_kwargs}
-    model = make_gac(policy_kwargs=policy_kwargs, train_freq=2).learn(40)
-    model.save(tmp_path / "model")
-    for one in (model, GAC.load(tmp_path / "model")):
-        for optimizer in optimizers_of(one.policy):
-            assert type(optimizer) is optimizer_class
-            for name, value in (optimizer_kwargs or {}).items():
-                assert optimizer.param_groups[0][name] == value
+def test_other_optimizers(tmp_path, optimizer_class, optimizer_kwargs):
+    _check_optimizers("gac", optimizer_class, optimizer_kwargs, tmp_path / "model")
 
 
-def test_every_parameter_but_the_targets_has_one_optimizer():
-    policy = make_gac().policy
+@algorithms()
+def test_every_parameter_but_the_targets_has_one_optimizer(algorithm):
+    policy = make(algorithm, pendulum()).policy
     optimized = [parameter for optimizer in optimizers_of(policy) for parameter in optimizer.param_groups[0]["params"]]
     targets = {id(parameter) for _, target in policy.pairs.values() for parameter in target.parameters()}
     assert len(optimized) == len({id(parameter) for parameter in optimized})
     assert {id(parameter) for parameter in policy.parameters()} - targets == {id(parameter) for parameter in optimized}
 
 
-def test_activation_function():
-    model = make_gac(policy_kwargs={"activation_fn": nn.Tanh}).learn(30)
-    for network in (model.policy.learner.latent_net, model.policy.guider.latent_net, model.critic.hidden):
-        assert any(isinstance(layer, nn.Tanh) for layer in network)
-        assert not any(isinstance(layer, nn.SiLU) for layer in network)
+@algorithms()
+def test_activation_function(algorithm):
+    model = make(algorithm, pendulum(), policy_kwargs={"activation_fn": nn.Tanh}).learn(20)
+    assert not any(isinstance(layer, nn.SiLU | nn.ReLU) for layer in model.policy.modules())
+    for role in model.policy.roles.networks:
+        network = getattr(model.policy, role)
+        assert network is None or role == "guider" or any(isinstance(layer, nn.Tanh) for layer in network.modules()), role
 
 
 class Scaled(BaseFeaturesExtractor):
@@ -94,9 +116,22 @@ class Scaled(BaseFeaturesExtractor):
         return self.linear(th.cat(list(observations.values()), dim=1))
 
 
+OWN_EXTRACTOR = {"features_extractor_class": Scaled, "features_extractor_kwargs": {"features_dim": 5}}
+
+
+@algorithms()
+def test_features_extractors_of_ones_own_are_trained(algorithm):
+    model = make(algorithm, pendulum(), policy_kwargs=OWN_EXTRACTOR)
+    targets = {id(module) for _, target in model.policy.pairs.values() for module in target.modules()}
+    extractors = [one for one in model.policy.modules() if isinstance(one, Scaled) and id(one) not in targets]
+    assert model.actor.features_extractor in extractors
+    before = [one.linear.weight.clone() for one in extractors]
+    model.learn(40)
+    assert not any(th.allclose(old, one.linear.weight) for old, one in zip(before, extractors, strict=True))
+
+
 def test_features_extractor_is_made_on_the_entries_of_each_role():
-    policy_kwargs = {"features_extractor_class": Scaled, "features_extractor_kwargs": {"features_dim": 5}}
-    model = make_gac(policy_kwargs=policy_kwargs)
+    model = make("gac", pendulum(), policy_kwargs=OWN_EXTRACTOR)
     roles = {"learner": 2, "guider": 3, "guider_critic": 3, "learner_critic": 3}
     before = {role: getattr(model.policy, role).features_extractor.linear.weight.clone() for role in roles}
     model.learn(40)
@@ -106,14 +141,13 @@ def test_features_extractor_is_made_on_the_entries_of_each_role():
         assert not th.allclose(before[role], weight), role
 
 
-class OwnPolicy(GACPolicy):
-    """A policy class of one's own."""
-
-
-def test_policy_class_of_ones_own(tmp_path):
-    model = GAC(OwnPolicy, pendulum(), learning_starts=10, policy_kwargs={"net_arch": [8]}).learn(20)
+@algorithms()
+def test_policy_class_of_ones_own(algorithm, tmp_path):
+    own = type("OwnPolicy", (algorithm_class(algorithm).policy_aliases["MultiInputPolicy"],), {})
+    model = make(algorithm, pendulum(), policy=own).learn(20)
+    assert type(model.policy) is own
     model.save(tmp_path / "model")
-    loaded = GAC.load(tmp_path / "model")
-    assert type(loaded.policy) is OwnPolicy
+    loaded = load(algorithm, tmp_path / "model")
+    assert type(loaded.policy).__name__ == "OwnPolicy"
     obs, _ = pendulum().reset()
     np.testing.assert_array_equal(*(one.predict(obs, deterministic=True)[0] for one in (model, loaded)))

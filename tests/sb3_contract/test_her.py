@@ -11,34 +11,43 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
 from sb3_gac.envs import SplitDictObservation
-from tests.helpers import TwoViewBandit, small_model
-from tests.sb3_contract.helpers import make_gac, sample_observations
+from tests.helpers import TwoViewBandit
+from tests.registry import algorithms, deployed_role, load, make
+from tests.sb3_contract.helpers import sample_observations
 
 LEARNER = ["observation", "desired_goal"]
+with_goals = algorithms("replay", "other buffers")
 
 
 def _env(**kwargs):
     return BitFlippingEnv(n_bits=4, continuous=True, **kwargs)
 
 
-def _make(env, her_kwargs=None, **kwargs):
+def _make(algorithm, env, her_kwargs=None, **kwargs):
     options = {"n_sampled_goal": 2, "goal_selection_strategy": "future", **(her_kwargs or {})}
-    her = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": options, "role_keys": {"learner": LEARNER}}
-    return make_gac(env, train_freq=4, **her, **kwargs)
+    her = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": options}
+    return make(algorithm, env, train_freq=4, role_keys={deployed_role(algorithm): LEARNER}, **her, **kwargs)
 
 
-@pytest.mark.parametrize("image", [False, True])
-def test_goal_environments(image):
+def _check_goal_environment(algorithm, image):
     policy_kwargs = {"features_extractor_kwargs": {"cnn_output_dim": 8}} if image else {}
-    model = _make(make_vec_env(lambda: _env(image_obs_space=image)), policy_kwargs=policy_kwargs).learn(60)
+    model = _make(algorithm, make_vec_env(lambda: _env(image_obs_space=image)), policy_kwargs=policy_kwargs).learn(20)
     assert model._n_updates > 0
     env = Monitor(_env(image_obs_space=image))
     evaluate_policy(model, env, n_eval_episodes=2)
     obs, _ = env.reset()
     action, _ = model.predict({key: obs[key] for key in LEARNER}, deterministic=True)
     np.testing.assert_array_equal(action, model.predict(obs, deterministic=True)[0])
+
+
+@with_goals
+def test_goal_environments(algorithm):
+    _check_goal_environment(algorithm, image=False)
+
+
+def test_goal_environments_with_images():
+    _check_goal_environment("gac", image=True)
 
 
 class _Rewarding(BitFlippingEnv):
@@ -52,49 +61,62 @@ class _Rewarding(BitFlippingEnv):
         return np.full(np.shape(achieved_goal)[:-1], float(self.number))
 
 
-def test_goals_are_rewarded_by_the_environments_that_the_model_has_now():
+@with_goals
+def test_goals_are_rewarded_by_the_environments_that_the_model_has_now(algorithm):
     """Those before may have been closed."""
-    model = _make(make_vec_env(lambda: _Rewarding(1)), {"n_sampled_goal": 4}).learn(40)
+    model = _make(algorithm, make_vec_env(lambda: _Rewarding(1)), {"n_sampled_goal": 4}).learn(20)
     model.set_env(make_vec_env(lambda: _Rewarding(2)))
     rewards = model.replay_buffer.sample(200).rewards.unique()
     assert 2 in rewards
-    assert model.learn(40, reset_num_timesteps=False)._n_updates > 0
+    assert model.learn(20, reset_num_timesteps=False)._n_updates > 0
 
 
-@pytest.mark.parametrize("strategy", ["final", "episode", "future"])
-def test_goal_selection_with_several_environments_and_noise(strategy):
+def _check_goal_selection(algorithm, strategy):
     noise = NormalActionNoise(np.zeros(4), 0.1 * np.ones(4))
     env = make_vec_env(_env, n_envs=2)
-    model = _make(env, {"goal_selection_strategy": strategy}, gradient_steps=2, action_noise=noise).learn(60)
+    model = _make(algorithm, env, {"goal_selection_strategy": strategy}, gradient_steps=2, action_noise=noise).learn(32)
     assert isinstance(model.action_noise, VectorizedActionNoise)
     assert model._n_updates > 0
 
 
-def test_model_and_buffer_are_saved_and_loaded(tmp_path):
+@with_goals
+def test_goal_selection_with_several_environments_and_noise(algorithm):
+    _check_goal_selection(algorithm, "future")
+
+
+@pytest.mark.parametrize("strategy", ["final", "episode"])
+def test_other_goal_selections(strategy):
+    _check_goal_selection("gac", strategy)
+
+
+@with_goals
+def test_model_and_buffer_are_saved_and_loaded(algorithm, tmp_path):
     env = make_vec_env(_env, n_envs=2)
-    model = _make(env, seed=0).learn(60)
+    model = _make(algorithm, env, seed=0).learn(32)
     observations = sample_observations(env, 5)
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer.pkl")
-    loaded = GAC.load(tmp_path / "model", env=env, custom_objects={"learning_rate": 2e-5}, verbose=2)
+    loaded = load(algorithm, tmp_path / "model", env, custom_objects={"learning_rate": 2e-5}, verbose=2)
     assert (loaded.verbose, loaded.learning_rate) == (2, 2e-5)
     np.testing.assert_array_equal(*(one.predict(observations, deterministic=True)[0] for one in (model, loaded)))
     loaded.load_replay_buffer(tmp_path / "buffer.pkl", truncate_last_traj=False)
     for key, value in model.replay_buffer.observations.items():
         np.testing.assert_array_equal(value, loaded.replay_buffer.observations[key])
-    assert loaded.learn(60, reset_num_timesteps=False)._n_updates > model._n_updates
+    assert loaded.learn(32, reset_num_timesteps=False)._n_updates > model._n_updates
 
 
-def test_full_buffer():
-    model = _make(make_vec_env(_env, n_envs=2), buffer_size=40, learning_starts=8).learn(100)
+@with_goals
+def test_full_buffer(algorithm):
+    model = _make(algorithm, make_vec_env(_env, n_envs=2), buffer_size=24, learning_starts=8).learn(48)
     assert model.replay_buffer.full
 
 
-def test_buffer_needs_an_environment(tmp_path):
-    model = _make(make_vec_env(_env)).learn(40)
+@with_goals
+def test_buffer_needs_an_environment(algorithm, tmp_path):
+    model = _make(algorithm, make_vec_env(_env)).learn(10)
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
-    loaded = GAC.load(tmp_path / "model")  # acting does without
+    loaded = load(algorithm, tmp_path / "model")  # acting does without
     with pytest.raises(AssertionError, match="HerReplayBuffer"):
         loaded.load_replay_buffer(tmp_path / "buffer")
     assert loaded.replay_buffer is None
@@ -142,7 +164,7 @@ UNFIT = {
 @pytest.mark.parametrize("unfit", UNFIT)
 def test_compute_reward_must_reward_rows_of_goals(unfit, n_envs):
     reward, message = UNFIT[unfit]
-    model = _make(make_vec_env(lambda: _Goals(reward), n_envs))
+    model = _make("gac", make_vec_env(lambda: _Goals(reward), n_envs))
     with pytest.raises(ValueError, match=rf"{message}.*needs N rewards"):
         model.learn(20)
     assert model.num_timesteps == 0
@@ -150,30 +172,30 @@ def test_compute_reward_must_reward_rows_of_goals(unfit, n_envs):
 
 def test_compute_reward_must_be_there():
     with pytest.raises(ValueError, match="The environment has no method compute_reward"):
-        _make(_Goals(None))
+        _make("gac", _Goals(None))
 
 
 def test_compute_reward_that_reads_infos_is_taken_at_its_word():
     def reward(achieved, desired, infos):
         return _distances(achieved, desired, infos) * [info["TimeLimit.truncated"] for info in infos]
 
-    assert _make(_Goals(reward), {"copy_info_dict": True}, learning_starts=20).learn(40)._n_updates > 0
+    assert _make("gac", _Goals(reward), {"copy_info_dict": True}, learning_starts=20).learn(40)._n_updates > 0
     with pytest.raises(ValueError, match=r"fails on 3 rows of goals \(KeyError\('TimeLimit.truncated'\)\)"):
-        _make(_Goals(reward)).learn(20)
+        _make("gac", _Goals(reward)).learn(20)
 
 
 @pytest.mark.parametrize("rewards", [_distances, lambda *goals: _distances(*goals)[:, None]])
 def test_rewards_of_goals_may_be_a_column(rewards):
-    assert _make(_Goals(rewards), learning_starts=20).learn(40)._n_updates > 0
+    assert _make("gac", _Goals(rewards), learning_starts=20).learn(40)._n_updates > 0
 
 
-@pytest.mark.parametrize("cls", [GAC, GACShare, GACWithoutQ, AsymmetricSAC])
-def test_an_environment_without_goals_is_named(cls):
+@with_goals
+def test_an_environment_without_goals_is_named(algorithm):
     env = SplitDictObservation(_Goals(_distances), ["observation", "desired_goal"], ["achieved_goal"])
     with pytest.raises(ValueError, match=r"HerReplayBuffer replaces goals .* has \['partial', 'privileged'\].*role_keys="):
-        small_model(env, cls, replay_buffer_class=HerReplayBuffer)
+        make(algorithm, env, replay_buffer_class=HerReplayBuffer)
 
 
 def test_goals_of_two_shapes_are_named():
     with pytest.raises(ValueError, match=r'"achieved_goal" in the place of "desired_goal", .* give them one shape'):
-        _make(_Goals(_distances, desired=(3,)))
+        _make("gac", _Goals(_distances, desired=(3,)))

@@ -9,9 +9,12 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import get_device
 
-from sb3_gac import GAC
+from sb3_gac.algorithms import algorithm_class
 from sb3_gac.envs import PARTIAL, PRIVILEGED
-from tests.sb3_contract.helpers import AsDict, RandomEnv, make_gac, pendulum, vectorized
+from tests.registry import LINES, algorithms, make
+from tests.sb3_contract.helpers import AsDict, RandomEnv, pendulum, vectorized
+
+GUIDED = [name for name in LINES if hasattr(algorithm_class(name), "predict_guider")]
 
 
 class SubClassedBox(spaces.Box):
@@ -26,27 +29,30 @@ def test_environment_with_subclassed_spaces_is_valid():
     check_env(_subclassed_env(), skip_render_check=True)
 
 
-def test_subclassed_spaces():
+@algorithms()
+def test_subclassed_spaces(algorithm):
     env = _subclassed_env()
-    model = make_gac(env).learn(60)
+    model = make(algorithm, env).learn(20)
     obs, _ = env.reset()
     action, _ = model.predict(obs)
     assert env.action_space.contains(action)
 
 
-def test_environment_is_wrapped_by_itself():
-    model = GAC("MultiInputPolicy", pendulum(), policy_kwargs={"net_arch": [16]}).learn(110)
+@algorithms()
+def test_environment_is_wrapped_by_itself(algorithm):
+    model = make(algorithm, pendulum(max_episode_steps=15)).learn(10)
     assert model.get_env().num_envs == 1
     assert model.get_env().env_is_wrapped(Monitor) == [True]
     assert len(model.ep_info_buffer) == 0
-    model.learn(200)
+    model.learn(20)
     assert len(model.ep_info_buffer) == 1
 
 
-def test_environment_is_made_from_its_id():
+@algorithms()
+def test_environment_is_made_from_its_id(algorithm):
     gym.register("sb3_contract/Pendulum-v0", pendulum)
     try:
-        model = GAC("MultiInputPolicy", "sb3_contract/Pendulum-v0", learning_starts=10, policy_kwargs={"net_arch": [16]})
+        model = make(algorithm, "sb3_contract/Pendulum-v0")
         assert model.learn(20).get_env().env_is_wrapped(Monitor) == [True]
     finally:
         del gym.registry["sb3_contract/Pendulum-v0"]
@@ -54,8 +60,9 @@ def test_environment_is_made_from_its_id():
 
 @pytest.mark.parametrize("device", ["cpu", "cuda", "auto"])
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_shapes_of_actions(device, deterministic):
-    model = make_gac(device=device)
+@algorithms()
+def test_shapes_of_actions(algorithm, device, deterministic):
+    model = make(algorithm, pendulum(), device=device)
     assert model.policy.device.type == get_device(device).type
     env = pendulum()
     obs, _ = env.reset()
@@ -65,14 +72,15 @@ def test_shapes_of_actions(device, deterministic):
         action, state = model.predict(single, deterministic=deterministic)
         assert isinstance(action, np.ndarray)
         assert env.action_space.contains(action)
-        assert state is None
+        assert (state is None) != LINES[algorithm].remembers
         actions, _ = model.predict(batched, deterministic=deterministic)
         assert actions.shape == (3, *env.action_space.shape)
         assert all(env.action_space.contains(action) for action in actions)
 
 
-def test_actions_depend_on_partial_alone_and_are_the_same_batched_or_not():
-    model = make_gac().learn(40)
+@algorithms()
+def test_actions_depend_on_partial_alone_and_are_the_same_batched_or_not(algorithm):
+    model = make(algorithm, pendulum()).learn(20)
     batch = vectorized(pendulum, 3).reset()
     actions, _ = model.predict(batch, deterministic=True)
     assert len(np.unique(actions)) == 3
@@ -83,8 +91,9 @@ def test_actions_depend_on_partial_alone_and_are_the_same_batched_or_not():
     np.testing.assert_allclose(actions, np.stack(singles), rtol=1e-5, atol=1e-6)
 
 
-def test_guider_needs_the_privileged_entry_and_uses_it():
-    model = make_gac(guider="independent").learn(40)
+@pytest.mark.parametrize("algorithm", GUIDED)
+def test_guider_needs_the_privileged_entry_and_uses_it(algorithm):
+    model = make(algorithm, pendulum()).learn(20)
     obs, _ = pendulum().reset()
     action, _ = model.predict_guider(obs, deterministic=True)
     assert pendulum().action_space.contains(action)
@@ -95,8 +104,9 @@ def test_guider_needs_the_privileged_entry_and_uses_it():
     assert model.predict_guider(batch)[0].shape == (3, 1)
 
 
-def test_stochastic_actions_vary_and_follow_the_seed():
-    model = make_gac()
+@algorithms()
+def test_stochastic_actions_vary_and_follow_the_seed(algorithm):
+    model = make(algorithm, pendulum())
     obs, _ = pendulum().reset()
 
     def actions():
@@ -108,15 +118,17 @@ def test_stochastic_actions_vary_and_follow_the_seed():
     assert actions() == first
 
 
-def test_actions_are_unscaled_to_the_environments_range():
-    model = make_gac()
+@algorithms()
+def test_actions_are_unscaled_to_the_environments_range(algorithm):
+    model = make(algorithm, pendulum())
     with th.no_grad():
         model.actor.head.mean.bias.fill_(100.0)
     obs, _ = pendulum().reset()
     np.testing.assert_allclose(model.predict(obs, deterministic=True)[0], pendulum().action_space.high)
 
 
-def test_gym_and_vec_env_apis_are_not_mixed():
+@algorithms()
+def test_gym_and_vec_env_apis_are_not_mixed(algorithm):
     env = gym.wrappers.TimeLimit(pendulum(), 10)
-    with pytest.raises(ValueError, match="mixing Gym API"):
-        make_gac(env).predict(env.reset())
+    with pytest.raises(ValueError, match=r"mixing Gym API|the pair \(observation, info\)"):
+        make(algorithm, env).predict(env.reset())

@@ -16,73 +16,73 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_gac import GAC, AsymmetricSAC
-from tests.helpers import Recall, TwoViewChoice, small_model
+from sb3_gac.algorithms import algorithm_class
+from tests.helpers import Recall, TwoViewChoice
+from tests.registry import LINES, load, load_all, make, on_policy, parameters, save_all
 
-GRU = {"policy": "MultiInputGruPolicy", "policy_kwargs": {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": []}}
+GRU = {"policy": "MultiInputGruPolicy", "batch_size": 4}
 KINDS = {
     "discrete": (partial(TwoViewChoice, length=4), {}),
     "recurrent": (partial(Recall, continuous=True), GRU),
     "recurrent and discrete": (Recall, GRU),
 }
-kinds = pytest.mark.parametrize("kind", KINDS)
-algorithms = pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
+WITH_MEMORY = [name for name, line in LINES.items() if "memory" not in line.lacks]
+kinds = pytest.mark.parametrize(
+    ("kind", "algorithm"),
+    [
+        *(("discrete", name) for name in LINES),
+        *(("recurrent", name) for name in WITH_MEMORY),
+        *(("recurrent and discrete", name) for name in ("gac", "asymmetric_mpo")),  # the one and the other way to do both
+    ],
+)
 
 
 def _env(kind, n_envs=2, seed=0):
     return make_vec_env(KINDS[kind][0], n_envs, seed=seed)
 
 
-def _model(kind, cls=GAC, env=None, **arguments):
-    return small_model(_env(kind) if env is None else env, cls=cls, **{**KINDS[kind][1], "batch_size": 4, **arguments})
-
-
-def _parameters(model):
-    return th.cat([p.detach().flatten() for p in model.policy.parameters()])
+def _model(kind, algorithm, env=None, **arguments):
+    return make(algorithm, _env(kind) if env is None else env, **{**KINDS[kind][1], "seed": 0, **arguments})
 
 
 @kinds
-@algorithms
-def test_learned_saved_loaded_and_learned_on_equal_seeds_give_equal_results(kind, cls, tmp_path):
+def test_learned_saved_loaded_and_learned_on_equal_seeds_give_equal_results(kind, algorithm, tmp_path):
     def learned_on(seed):
-        model = _model(kind, cls, seed=seed).learn(40)
-        model.save(tmp_path / "model")
-        model.save_replay_buffer(tmp_path / "buffer")
-        loaded = cls.load(tmp_path / "model", env=_env(kind, seed=1))
-        loaded.load_replay_buffer(tmp_path / "buffer")
-        assert th.equal(_parameters(loaded), _parameters(model))
+        model = _model(kind, algorithm, seed=seed).learn(20)
+        save_all(model, tmp_path)
+        loaded = load_all(algorithm, tmp_path, _env(kind, seed=1))
+        assert th.equal(parameters(loaded), parameters(model))
         loaded.set_random_seed(seed)
-        loaded.learn(40, reset_num_timesteps=False)
-        assert (loaded.num_timesteps, loaded.replay_buffer.size()) == (80, 40)
+        loaded.learn(20, reset_num_timesteps=False)
+        assert loaded.num_timesteps == 40
+        assert on_policy(algorithm) or loaded.replay_buffer.size() == 20
         assert loaded._n_updates > model._n_updates > 0
-        return _parameters(loaded)
+        return parameters(loaded)
 
     first = learned_on(0)
     assert th.equal(first, learned_on(0))
-    assert not th.equal(first, learned_on(1))
+    if algorithm == "gac":
+        assert not th.equal(first, learned_on(1))
 
 
 @kinds
-@algorithms
-def test_training_goes_on_after_load_as_if_it_had_not_stopped(kind, cls, tmp_path):
-    model = _model(kind, cls).learn(40)
-    model.save(tmp_path / "model")
-    model.save_replay_buffer(tmp_path / "buffer")
-    loaded = cls.load(tmp_path / "model", env=_env(kind))
-    loaded.load_replay_buffer(tmp_path / "buffer")
-    loaded.set_logger(model.logger)
+def test_training_goes_on_after_load_as_if_it_had_not_stopped(kind, algorithm, tmp_path):
+    model = _model(kind, algorithm).learn(20)
+    save_all(model, tmp_path)
+    loaded = load_all(algorithm, tmp_path, _env(kind))
+    model.set_env(_env(kind))
     for one in (model, loaded):
         one.set_random_seed(3)
-        one.train(gradient_steps=3, batch_size=4)
-    assert th.equal(_parameters(model), _parameters(loaded))
-    for name in ("ent_coef_dual", "kl_coef_dual") if cls is GAC else ("ent_coef_dual",):
-        assert th.equal(getattr(model, name).value, getattr(loaded, name).value)
+        one.learn(20, reset_num_timesteps=False)
+    assert th.equal(parameters(model), parameters(loaded))
+    assert model._n_updates == loaded._n_updates > 0
+    for name, coefficient in model.coefficients.items():
+        assert th.equal(coefficient.value, loaded.coefficients[name].value), name
 
 
 @kinds
-@algorithms
-def test_eval_callback_and_tensorboard(kind, cls, tmp_path):
-    model = _model(kind, cls, tensorboard_log=str(tmp_path))
+def test_eval_callback_and_tensorboard(kind, algorithm, tmp_path):
+    model = _model(kind, algorithm, tensorboard_log=str(tmp_path))
     callback = EvalCallback(
         _env(kind), eval_freq=10, n_eval_episodes=3, log_path=tmp_path, best_model_save_path=tmp_path, verbose=0, warn=False
     )
@@ -90,24 +90,23 @@ def test_eval_callback_and_tensorboard(kind, cls, tmp_path):
     evaluations = np.load(tmp_path / "evaluations.npz")
     assert evaluations["timesteps"].tolist() == [20, 40]
     assert (evaluations["ep_lengths"] == 4).all()
-    assert evaluate_policy(cls.load(tmp_path / "best_model"), _env(kind), n_eval_episodes=3, warn=False)[0] <= 4
-    events = EventAccumulator(str(tmp_path / f"{cls.__name__}_1")).Reload()
-    assert {"eval/mean_reward", "rollout/ep_rew_mean", "train/actor_loss", "train/ent_coef"} <= set(events.Tags()["scalars"])
+    assert evaluate_policy(load(algorithm, tmp_path / "best_model"), _env(kind), n_eval_episodes=3, warn=False)[0] <= 4
+    events = EventAccumulator(str(tmp_path / f"{algorithm_class(algorithm).__name__}_1")).Reload()
+    assert {"eval/mean_reward", "rollout/ep_rew_mean", "train/critic_loss"} <= set(events.Tags()["scalars"])
     assert all(np.isfinite(event.value) for tag in events.Tags()["scalars"] for event in events.Scalars(tag))
 
 
 @kinds
-@algorithms
-def test_behind_vec_normalize(kind, cls, tmp_path):
+def test_behind_vec_normalize(kind, algorithm, tmp_path):
     env = VecNormalize(_env(kind), norm_obs_keys=["partial"])
-    model = _model(kind, cls, env).learn(40)
+    model = _model(kind, algorithm, env).learn(20)
     assert model._n_updates > 0
-    assert env.obs_rms["partial"].count > 40
+    assert env.obs_rms["partial"].count > 20
     model.save(tmp_path / "model")
     env.save(tmp_path / "statistics")
     test_env = VecNormalize.load(tmp_path / "statistics", _env(kind, 3))
     test_env.training = test_env.norm_reward = False
-    loaded = cls.load(tmp_path / "model", env=test_env)
+    loaded = load(algorithm, tmp_path / "model", test_env)
     assert loaded.get_vec_normalize_env() is test_env
     assert loaded.learn(30)._n_updates > 0
     returns, _ = evaluate_policy(loaded, test_env, n_eval_episodes=6, return_episode_rewards=True, warn=False)
@@ -115,25 +114,26 @@ def test_behind_vec_normalize(kind, cls, tmp_path):
 
 
 @kinds
-@algorithms
-def test_other_environments_take_the_place_of_the_first(kind, cls):
-    model = _model(kind, cls).learn(22)  # in the middle of an episode
-    with pytest.raises(AssertionError, match="filled by 2 environments, but the model has 3"):
-        model.set_env(_env(kind, 3))
+def test_other_environments_take_the_place_of_the_first(kind, algorithm):
+    at_once = {} if on_policy(algorithm) else {"train_freq": 1}
+    model = _model(kind, algorithm, **at_once).learn(22)  # in the middle of an episode
+    if not on_policy(algorithm):
+        with pytest.raises(AssertionError, match="filled by 2 environments, but the model has 3"):
+            model.set_env(_env(kind, 3))
     model.set_env(_env(kind, seed=5))
     assert model._last_obs is None
     before = model._n_updates
     assert model.learn(20, reset_num_timesteps=False)._n_updates > before
-    assert model.replay_buffer.endings[10].tolist() == [4, 4], "the episodes under way were cut"
+    if not on_policy(algorithm):
+        assert model.replay_buffer.endings[10].tolist() == [4, 4], "the episodes under way were cut"
 
 
 @kinds
-@algorithms
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_evaluate_policy_takes_any_number_of_environments(kind, cls, n_envs):
-    model = _model(kind, cls)
-    returns, lengths = evaluate_policy(
-        model, _env(kind, n_envs), n_eval_episodes=5, deterministic=False, return_episode_rewards=True, warn=False
-    )
-    assert len(returns) == 5
-    assert lengths == [4] * 5
+def test_evaluate_policy_takes_any_number_of_environments(kind, algorithm):
+    model = _model(kind, algorithm)
+    for n_envs in (1, 3):
+        returns, lengths = evaluate_policy(
+            model, _env(kind, n_envs), n_eval_episodes=5, deterministic=False, return_episode_rewards=True, warn=False
+        )
+        assert len(returns) == 5
+        assert lengths == [4] * 5

@@ -9,7 +9,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan
 
 from sb3_gac.envs import PARTIAL, PRIVILEGED
-from tests.sb3_contract.helpers import ACTIONS, AsDict, RandomEnv, identity, make_gac, pendulum
+from tests.registry import algorithms, is_taught, make, on_policy
+from tests.sb3_contract.helpers import ACTIONS, AsDict, RandomEnv, identity, pendulum
 
 FLOAT32 = spaces.Box(-1, 1, (2,), np.float32)
 FLOAT64 = spaces.Box(-1, 1, (2,), np.float64)
@@ -31,10 +32,9 @@ def test_named_environments_of_these_tests_are_valid(make_env):
     check_env(make_env(), warn=False, skip_render_check=True)
 
 
-@pytest.mark.parametrize("entry", DISCRETE_ENTRIES, ids=str)
-def test_discrete_observation_entries(entry):
+def _check_entry(algorithm, entry):
     env = AsDict(RandomEnv(entry, ACTIONS))
-    model = make_gac(env, gamma=0.5, seed=1).learn(60)
+    model = make(algorithm, env, gamma=0.5, seed=1).learn(20)
     returns, lengths = evaluate_policy(model, env, n_eval_episodes=2, warn=False, return_episode_rewards=True)
     assert lengths == [20, 20]
     assert returns == [0, 0]
@@ -44,39 +44,56 @@ def test_discrete_observation_entries(entry):
     assert model.predict({PARTIAL: entry.sample()})[0].shape == (2,)
 
 
+@algorithms()
+def test_a_discrete_observation_entry(algorithm):
+    _check_entry(algorithm, spaces.MultiDiscrete([4, 3]))
+
+
+@pytest.mark.parametrize("entry", DISCRETE_ENTRIES[1:], ids=str)
+def test_other_discrete_observation_entries(entry):
+    _check_entry("gac", entry)
+
+
+def _untaught(algorithm, env):
+    return make(algorithm, env, **({"teacher": None} if is_taught(algorithm) else {}))
+
+
 @pytest.mark.parametrize(
     "space",
     [spaces.MultiDiscrete([4, 3]), spaces.MultiBinary(3)],
     ids=str,
 )
-def test_other_actions_are_refused(space):
+@algorithms()
+def test_other_actions_are_refused(algorithm, space):
     with pytest.raises(AssertionError, match="supports Box and Discrete action spaces"):
-        make_gac(AsDict(RandomEnv(FLOAT32, space)))
+        _untaught(algorithm, AsDict(RandomEnv(FLOAT32, space)))
 
 
-def test_observations_that_are_not_a_dict_are_refused():
+@algorithms()
+def test_observations_that_are_not_a_dict_are_refused(algorithm):
     with pytest.raises(ValueError, match="must be a Dict"):
-        make_gac(gym.make("Pendulum-v1"))
+        _untaught(algorithm, gym.make("Pendulum-v1"))
 
 
-@pytest.mark.parametrize("observation_space", [FLOAT32, FLOAT64], ids=str)
 @pytest.mark.parametrize(
-    "action_space",
+    ("observation_space", "action_space"),
     [
-        FLOAT32,
-        FLOAT64,
-        spaces.Box(-1, 1, (2, 2), np.float32),
-        spaces.Box(np.array([-2, 0], np.float64), np.array([1, 5], np.float64), dtype=np.float64),
+        (FLOAT64, FLOAT64),
+        (FLOAT32, spaces.Box(-1, 1, (2, 2), np.float32)),
+        (FLOAT64, spaces.Box(np.array([-2, 0], np.float64), np.array([1, 5], np.float64), dtype=np.float64)),
     ],
     ids=str,
 )
-def test_float64_and_multi_dimensional_spaces(observation_space, action_space):
+@algorithms()
+def test_float64_and_multi_dimensional_spaces(algorithm, observation_space, action_space):
     env = AsDict(RandomEnv(observation_space, action_space), entries=(PARTIAL,))
-    model = make_gac(env, learning_starts=30).learn(50)
-    assert model._n_updates == 20
-    assert model.replay_buffer.actions.dtype == np.float32
+    model = make(algorithm, env).learn(20)
+    assert model._n_updates > 0
+    if not on_policy(algorithm):  # SB3's rollouts have the space's
+        assert model.replay_buffer.actions.dtype == np.float32
     obs, _ = env.reset()
-    for act in (model.predict, model.predict_guider):
+    guiders = [model.predict_guider] if hasattr(model, "predict_guider") else []
+    for act in (model.predict, *guiders):
         for deterministic in (False, True):
             action, _ = act(obs, deterministic=deterministic)
             assert action.dtype == action_space.dtype
@@ -92,12 +109,14 @@ class _NanEnv(RandomEnv):
 
 
 @pytest.mark.parametrize("wrapper", [VecCheckNan, None])
-def test_nan_observations_stop_training(wrapper):
+@algorithms()
+def test_nan_observations_stop_training(algorithm, wrapper):
     env = DummyVecEnv([lambda: AsDict(_NanEnv(FLOAT32, ACTIONS), entries=(PRIVILEGED,))])
     if wrapper is not None:
         env = wrapper(env, raise_exception=True)
-    model = make_gac(env)
+    model = make(algorithm, env)
     with pytest.raises(ValueError, match=r"(?i)nan.*privileged|privileged.*nan"):
         model.learn(10)
-    assert not np.isnan(model.replay_buffer.next_observations[PRIVILEGED]).any()
-    assert model.replay_buffer.pos == 2
+    if not on_policy(algorithm):
+        assert not np.isnan(model.replay_buffer.next_observations[PRIVILEGED]).any()
+    assert (model.rollout_buffer if on_policy(algorithm) else model.replay_buffer).pos == 2
