@@ -13,12 +13,12 @@ BASELINES = sorted({path.stem for path in (ROOT / "sb3_gac/baselines").glob("[!_
 #: Room -> rooms that it may import
 ROOMS = {
     "math": "math",
-    "checks": "checks",
+    "checks": "checks|schedules",
     "optim": "optim|math|checks",
     "networks": "networks|math|checks",
     "replay": "replay|checks",
     "checkpoint": "checkpoint|envs",
-    "base": "algorithms|base|math|checks|optim|networks|replay|checkpoint|envs",
+    "base": "algorithms|base|math|checks|schedules|optim|networks|replay|checkpoint|envs",
     "deploy": "deploy|base|checks|networks|envs|learner|version",
 }
 FORBIDDEN = {
@@ -29,6 +29,7 @@ FORBIDDEN = {
         for name in BASELINES
         for pattern in ("{}.py", "{}/**/*.py")
     },
+    "sb3_gac/schedules.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "sb3_gac/algorithms.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.algorithms\b)",
     "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
