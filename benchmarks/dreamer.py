@@ -20,14 +20,18 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from omegaconf import OmegaConf
-from sheeprl.algos.dreamer_v3_5.agent import build_agent
-from sheeprl.cli import run as run_sheeprl
-from sheeprl.envs.wrappers import NormalizeAction
-from sheeprl.utils import fs
-from sheeprl.utils.utils import dotdict
 
 from benchmarks.program import Request
+
+try:
+    from omegaconf import OmegaConf
+    from sheeprl.algos.dreamer_v3_5.agent import build_agent
+    from sheeprl.cli import run as run_sheeprl
+    from sheeprl.envs.wrappers import NormalizeAction
+    from sheeprl.utils import fs
+    from sheeprl.utils.utils import dotdict
+except ImportError as error:
+    raise ImportError(f'benchmarks.dreamer needs sheeprl ({error}): pip install "sb3_gac[dreamer]".') from None
 
 SIZES = ("1M", "12M", "25M", "50M", "100M", "200M", "400M")
 KEY = "partial"

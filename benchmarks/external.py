@@ -78,7 +78,7 @@ class Program:
     @property
     def interpreter(self) -> str:
         """Which ``python`` is meant."""
-        return os.environ.get(self._variable or "", "") or sys.executable
+        return os.environ.get(self._variable or "") or sys.executable
 
     @property
     def command(self) -> list[str]:
@@ -93,7 +93,8 @@ class Program:
         """
         if not self._packages:
             return {}
-        where = f"the interpreter that {self._variable} names" if self._variable in os.environ else "this interpreter"
+        is_named = bool(os.environ.get(self._variable or ""))
+        where = f"the interpreter that {self._variable} names" if is_named else "this interpreter"
         try:
             asked = subprocess.run([self.interpreter, "-c", _ASK, *self._packages], capture_output=True, text=True, check=True)
         except (OSError, subprocess.CalledProcessError) as error:
