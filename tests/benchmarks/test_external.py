@@ -139,10 +139,14 @@ def test_evaluations_are_as_those_of_all_algorithms_are(tmp_path):
     model.learn(2, callback=evaluation)
     assert first == evaluation.history[0]["learner"]
     assert request.evaluate(40, policy) != first, "other actions"
-    assert Request(request.path).rows == request.rows == [
-        {"timesteps": 20, "learner": first},
-        {"timesteps": 40, "learner": request.rows[1]["learner"]},
-    ]
+    assert (
+        Request(request.path).rows
+        == request.rows
+        == [
+            {"timesteps": 20, "learner": first},
+            {"timesteps": 40, "learner": request.rows[1]["learner"]},
+        ]
+    )
     request.go_on_from(39)
     assert [row["timesteps"] for row in request.rows] == [20]
 
