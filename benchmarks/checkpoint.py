@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_gac import ExactCheckpointCallback, SeededEvalCallback
 from sb3_gac.checkpoint.files import checkpoints
 
-CHECKPOINT = "checkpoint"
+CHECKPOINT, TIMING = "checkpoint", "timing.json"
 #: A model and its evaluations so far
 Resumed: TypeAlias = tuple[BaseAlgorithm, list[dict[str, float]]]
 
@@ -32,6 +32,24 @@ def write_atomically(path: Path, text: str) -> None:
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+
+
+def read_seconds(path: Path) -> float:
+    """
+    :param path: of a run's ``timing.json``
+    :return: seconds that the run has taken so far
+    """
+    return float(json.loads(path.read_text())["seconds"]) if path.exists() else 0.0
+
+
+def write_timing(path: Path, seconds: float, steps: int, learner: float) -> None:
+    """
+    :param path: of a run's ``timing.json``
+    :param seconds: from the run's start to its last evaluation
+    :param steps: of the environments up to then
+    :param learner: return there
+    """
+    write_atomically(path, json.dumps({"seconds": seconds, "steps": steps, "learner": learner}))
 
 
 @contextmanager

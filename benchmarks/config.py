@@ -12,6 +12,7 @@ from typing import Any
 from stable_baselines3.common.logger import Logger
 
 from benchmarks.environments import environment, make_envs, normalized
+from benchmarks.external import Program
 from benchmarks.suite import RunSpec, check_is, check_keys, check_numbers, needed_runs, read_definitions, with_needed
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.base.arguments import present_names
@@ -78,6 +79,22 @@ def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
             try_out(where, spec)
 
 
+def check_programs(specs: Iterable[RunSpec]) -> None:
+    """
+    Whether the programs that train outside of this process have the packages that they need.
+
+    :param specs: of runs
+    :raises ValueError: naming what is missing, and where
+    """
+    for name, spec in {spec.algorithm: spec for spec in specs}.items():
+        kind, arguments = resolve(spec)
+        if issubclass(kind, Program):
+            try:
+                kind(**arguments).versions()
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from None
+
+
 def try_out(where: str, spec: RunSpec) -> None:
     """
     Make a run's environment, and on it, unless it needs another run first, its algorithm, which takes one step.
@@ -89,7 +106,7 @@ def try_out(where: str, spec: RunSpec) -> None:
     try:
         env = normalized(make_envs(spec, min(spec.envs, 2), spec.seed), normalization(spec))
         try:
-            if spec.needs is None:
+            if spec.needs is None and not issubclass(resolve(spec)[0], Program):
                 kind, arguments = resolve(spec)
                 small = {"buffer_size": 1_000, "learning_starts": 10**9, "n_epochs": 1}
                 known = constructor_parameters(kind)
@@ -106,10 +123,12 @@ def try_out(where: str, spec: RunSpec) -> None:
 def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
     """
     :param spec: of a run
-    :return: class of the algorithm, and its arguments, as YAML has them
+    :return: class of the algorithm, and its arguments, as YAML has them; a program's are those of its definition alone
     :raises ValueError: if an argument is unknown to the class or its policy, or is a number that YAML reads as text
     """
     kind, own = read_algorithm(spec.algorithm, spec.definition)
+    if issubclass(kind, Program):
+        return kind, _of_program(spec, kind, own)
     preset = read_preset(spec.preset)
     task = spec.task if spec.environment is None else None
     resolved: dict[str, Any] = {}
@@ -129,6 +148,18 @@ def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
     _check_known(f"{spec.algorithm}, policy_kwargs", of_policy, policies[policy], _GIVEN_TO_POLICIES)
     check_numbers(spec.algorithm, resolved)
     return kind, resolved
+
+
+def _of_program(spec: RunSpec, kind: type[Program], own: dict[str, Any]) -> dict[str, Any]:
+    _check_known(spec.algorithm, {**own, **needed_runs(spec)}, kind, set())
+    check_numbers(spec.algorithm, own)
+    if (options := normalization(spec)) is not None:
+        raise ValueError(f"{spec.algorithm}: a program normalises by itself, or not at all; there is normalize: {options}.")
+    try:
+        kind(**own)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{spec.algorithm}: {error}") from None
+    return own
 
 
 def _present(where: str, kind: type, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,13 +33,15 @@ def run_process(command: list[str], log: Path) -> int:
             stderr=subprocess.STDOUT,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
             cwd=HERE.parent,
-            preexec_fn=_end_with_parent if _prctl else None,
+            preexec_fn=end_with_parent,
             check=False,
         ).returncode
 
 
-def _end_with_parent() -> None:
-    _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+def end_with_parent() -> None:
+    """In a process that begins: it is killed when the thread that started it ends. Not so elsewhere than on Linux."""
+    if _prctl:
+        _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 class LocalEngine:

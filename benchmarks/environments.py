@@ -12,6 +12,9 @@ from benchmarks.suite import RunSpec
 from sb3_gac.algorithms import import_path
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 
+#: Of the environments of every evaluation
+EVAL_SEED = 10_000
+
 
 def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
     """

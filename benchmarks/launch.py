@@ -28,7 +28,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from benchmarks.config import check_runs
+from benchmarks.config import check_programs, check_runs
 from benchmarks.engines import Engine, LocalEngine, RayEngine
 from benchmarks.finished import add_reuse_options, name_of, read_reused
 from benchmarks.run import file_for
@@ -286,6 +286,8 @@ def main() -> None:
     options = parser.parse_args()
     try:
         jobs, finished = jobs_left(options.suite.resolve(), options.runs.resolve(), options.reuse_results, options.rerun)
+        if not options.dry_run:
+            check_programs(job.spec for job in jobs)
     except ValueError as error:
         sys.exit(str(error))
     if options.dry_run:

@@ -8,17 +8,16 @@ The directory holds ``evaluations.csv`` if and only if the run is finished.
 """
 
 import argparse
-import csv
 import dataclasses
-import io
-import json
 import os
 import platform
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch as th
@@ -28,14 +27,15 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_gac
-from benchmarks.checkpoint import checkpoints_of, locked, write_atomically
+from benchmarks.checkpoint import TIMING, checkpoints_of, locked, read_seconds, write_atomically, write_timing
 from benchmarks.config import POLICY, in_present_names, normalization, resolve, settings_in_present_names
-from benchmarks.environments import make_envs, normalized
+from benchmarks.environments import EVAL_SEED, make_envs, normalized
+from benchmarks.external import Program
+from benchmarks.program import read_rows, rows_as_text
 from benchmarks.suite import HERE, RUNS, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.base.recording import holds_every_step
 from sb3_gac.presets import instantiate
 
-EVAL_SEED = 10_000
 CONFIGURATION, MODEL = "config.yaml", "model.zip"
 STATISTICS, RECORDING = "vecnormalize.pkl", "recording.npz"
 
@@ -74,7 +74,10 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
         if (options := normalization(spec)) is not None:
             configuration["normalize"] = options
         _refuse_other_settings(directory / CONFIGURATION, algorithm_class, configuration)
-        history = _train(spec, directory, algorithm_class, configuration, models, progress_bar)
+        if issubclass(algorithm_class, Program):
+            history = _run_program(spec, directory, algorithm_class(**arguments), configuration)
+        else:
+            history = _train(spec, directory, algorithm_class, configuration, models, progress_bar)
         write_evaluations(history, directory / "evaluations.csv")
         checkpoints_of(algorithm_class, directory).remove()
     return directory
@@ -112,9 +115,16 @@ def _comparable(algorithm_class: type, configuration: dict[str, Any]) -> dict[st
     return {**configuration, "run": run, "arguments": arguments}
 
 
-def _write_configuration(path: Path, configuration: dict[str, Any], resumed: bool) -> None:
-    """With the commit and versions of this process, and, if it goes on where others stopped, theirs where they differ."""
+def _write_configuration(
+    path: Path, configuration: dict[str, Any], resumed: bool, versions: Mapping[str, str] = MappingProxyType({})
+) -> None:
+    """
+    With the commit and versions of this process, and, if it goes on where others stopped, theirs where they differ.
+
+    :param versions: of what another process trains with
+    """
     now = provenance()
+    now["versions"] = {**now["versions"], **versions}
     before = made_with(yaml.safe_load(path.read_text())) if resumed else []
     earlier = [origin for origin in before if origin not in made_with(now)]
     write_atomically(path, yaml.safe_dump(configuration | now | {"earlier": earlier}, sort_keys=False))
@@ -133,7 +143,7 @@ class Stopwatch(BaseCallback):
     def __init__(self, path: Path, evaluation: sb3_gac.SeededEvalCallback, resumed: bool):
         super().__init__()
         self._path, self._evaluation, self._started = path, evaluation, time.time()
-        self._before = json.loads(path.read_text())["seconds"] if resumed and path.exists() else 0.0
+        self._before = read_seconds(path) if resumed else 0.0
 
     def _on_step(self) -> bool:
         if self.n_calls % self._evaluation.eval_freq == 0:
@@ -142,8 +152,8 @@ class Stopwatch(BaseCallback):
 
     def write(self) -> None:
         """Replace the file."""
-        spent = {"seconds": self._before + time.time() - self._started, "steps": self.model.num_timesteps}
-        write_atomically(self._path, json.dumps(spent | {"learner": float(self._evaluation.history[-1]["learner"])}))
+        learner = float(self._evaluation.history[-1]["learner"])
+        write_timing(self._path, self._before + time.time() - self._started, self.model.num_timesteps, learner)
 
 
 def _train(
@@ -169,7 +179,7 @@ def _train(
     arguments = {"policy": POLICY, **instantiate(configuration["arguments"]), **models, "seed": spec.seed}
     resumed = checkpoints.resume(algorithm_class, arguments, env, spec.seed)
     _write_configuration(directory / CONFIGURATION, configuration, resumed=resumed is not None)
-    stopwatch = Stopwatch(directory / "timing.json", evaluation, resumed=resumed is not None)
+    stopwatch = Stopwatch(directory / TIMING, evaluation, resumed=resumed is not None)
     if resumed is None:
         model = algorithm_class(env=env, device="cpu", **arguments)
     else:
@@ -187,6 +197,13 @@ def _train(
     return evaluation.history
 
 
+def _run_program(spec: RunSpec, directory: Path, program: Program, configuration: dict[str, Any]) -> list[dict[str, float]]:
+    """:return: one row per evaluation"""
+    resumed = bool(read_rows(directory))
+    _write_configuration(directory / CONFIGURATION, configuration, resumed, program.versions())
+    return program.run(spec, directory)
+
+
 def _evaluation_class(algorithm_class: type) -> type[sb3_gac.SeededEvalCallback]:
     """An algorithm with a guider has it evaluated beside what is deployed."""
     return sb3_gac.GuiderLearnerEvalCallback if hasattr(algorithm_class, "predict_guider") else sb3_gac.SeededEvalCallback
@@ -199,11 +216,7 @@ def write_evaluations(history: list[dict[str, float]], path: Path) -> None:
     :param history: one row per evaluation
     :param path: CSV file
     """
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, history[-1].keys(), restval="nan")
-    writer.writeheader()
-    writer.writerows(history)
-    write_atomically(path, text.getvalue())
+    write_atomically(path, rows_as_text(history))
 
 
 def main() -> None:

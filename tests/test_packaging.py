@@ -27,6 +27,7 @@ PARTS = {  # extra -> what of it is needed, and what needs it
     "benchmarks, report": (["plotly"], "import benchmarks.report"),
     "benchmarks, aggregate": (["rliable"], "import benchmarks.aggregate"),
     "benchmarks, run": (["tensorboard"], "import benchmarks.run"),
+    "dreamer": (["sheeprl"], "import benchmarks.dreamer"),
     "ray": (["ray"], "from benchmarks.engines import RayEngine; RayEngine('auto')"),
 }
 

@@ -1,0 +1,236 @@
+"""
+DreamerV3 on the learner's view, by the package sheeprl, as a program of :mod:`benchmarks.external`::
+
+    python -m benchmarks.dreamer benchmarks/runs/<run>/request.json
+
+Of ``arguments``, ``size`` is that of the model ("1M" to "400M") and ``configuration`` has sheeprl's settings by their dotted
+names. It is the algorithm of the paper in Nature (2025), ``dreamer_v3_5`` in sheeprl. What goes on from a checkpoint has its
+networks, optimiser and replay buffer, and starts new episodes. Evaluations take the most likely action in each state, but
+sheeprl draws the state itself, also then: they draw from the evaluation's seed, and training never notices.
+"""
+
+import json
+import shutil
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from benchmarks.program import Request
+
+try:
+    from omegaconf import OmegaConf
+    from sheeprl.algos.dreamer_v3_5.agent import build_agent
+    from sheeprl.cli import run as run_sheeprl
+    from sheeprl.envs.wrappers import NormalizeAction
+    from sheeprl.utils import fs
+    from sheeprl.utils.utils import dotdict
+except ImportError as error:
+    raise ImportError(f'benchmarks.dreamer needs sheeprl ({error}): pip install "sb3_gac[dreamer]".') from None
+
+SIZES = ("1M", "12M", "25M", "50M", "100M", "200M", "400M")
+KEY = "partial"
+LARGEST_BUFFER = 5_000_000  # sheeprl's, and the paper's
+
+
+class LearnersView(gym.ObservationWrapper):
+    """
+    What the learner sees, and nothing else.
+
+    :param env: with an entry ``partial``
+    :raises ValueError: if that is no vector of numbers
+    """
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        space = env.observation_space[KEY]  # type: ignore[index]
+        if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+            raise ValueError(f"DreamerV3 is set up for vectors here: {KEY} must be a Box with one axis, got {space}.")
+        self.observation_space = spaces.Dict({KEY: space})
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """
+        :param observation: of the environment
+        :return: its entry ``partial``
+        """
+        return {KEY: observation[KEY]}
+
+
+def make_env(request: str) -> gym.Env:
+    """
+    :param request: path
+    :return: environment to train on, for sheeprl to make
+    """
+    return LearnersView(Request(request).make_env())
+
+
+class Player:
+    """
+    The policy, as SB3's ``evaluate_policy`` knows them.
+
+    :param player: sheeprl's, which keeps a state for each environment
+    :param env: one of the environments to train on
+    """
+
+    def __init__(self, player: Any, env: gym.Env):
+        self._player = player
+        self._is_continuous = isinstance(env.action_space, spaces.Box)
+        self._rescaled = NormalizeAction(env).action if self._is_continuous else None
+
+    @th.no_grad()
+    def predict(
+        self,
+        observation: Mapping[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        """
+        :param observation: entries of shape (n, ...)
+        :param state: ``None`` at the start; then what was returned
+        :param episode_start: shape (n,), where an episode has just begun
+        :param deterministic: whether the most likely action is taken
+        :return: actions, shape (n, ...), as the environment takes them
+        """
+        partial = th.as_tensor(observation[KEY], dtype=th.float32, device=self._player.device)
+        if state is None:
+            self._player.num_envs = len(partial)
+            self._player.init_states()
+        elif episode_start is not None and episode_start.any():
+            self._player.init_states(np.flatnonzero(episode_start).tolist())
+        actions = self._player.get_actions({KEY: partial[None]}, greedy=deterministic)
+        if self._rescaled is None:
+            choices = th.stack([one_hot.argmax(-1) for one_hot in actions], -1)[0]
+            return choices.squeeze(-1).cpu().numpy(), ()
+        return self._rescaled(th.cat(actions, -1)[0].cpu().numpy()), ()
+
+
+class Evaluation:
+    """
+    What sheeprl calls before it writes a checkpoint: a checkpoint has its evaluation.
+
+    :param request: path
+    """
+
+    def __init__(self, request: str):
+        self._request = Request(request)
+        self._env = make_env(request)
+
+    def on_checkpoint_coupled(self, fabric: Any, ckpt_path: str, state: Mapping[str, Any], replay_buffer: Any = None) -> None:
+        """
+        :param fabric: of the run
+        :param ckpt_path: which is to be written
+        :param state: of the networks, and how far the run is
+        :param replay_buffer: not looked at
+        """
+        timesteps = int(state["last_checkpoint"])
+        self._request.go_on_from(timesteps - 1)
+        with th.random.fork_rng():
+            th.manual_seed(self._request.eval_seed)
+            mean_return = self._request.evaluate(timesteps, self._player(fabric, ckpt_path, state))
+        th.save({name: state[name] for name in ("world_model", "actor")}, self._request.path.with_name("model.pt"))
+        print(f"{timesteps} steps: {mean_return:.1f}", flush=True)
+
+    def _player(self, fabric: Any, ckpt_path: str, state: Mapping[str, Any]) -> Player:
+        """With networks beside those that train, made as sheeprl does to evaluate a checkpoint."""
+        configuration = dotdict(OmegaConf.to_container(fs.load_yaml(fs.run_config(ckpt_path)), resolve=True))
+        actions = self._env.action_space
+        sizes = actions.shape if isinstance(actions, spaces.Box) else [actions.n]  # type: ignore[attr-defined]
+        spaces_of = tuple(sizes), isinstance(actions, spaces.Box), configuration, self._env.observation_space
+        *networks, _, player = build_agent(fabric, *spaces_of, state["world_model"], state["actor"])
+        parameters = sum(parameter.numel() for network in networks for parameter in network.parameters())
+        print(f"{parameters:,} parameters of world model, actor and critic", flush=True)
+        return Player(player, self._env)
+
+
+def command_line(request: Request) -> list[str]:
+    """
+    :param request: of the run
+    :return: sheeprl's arguments
+    :raises ValueError: if an argument is unknown, or one that follows from the run
+    """
+    if unknown := sorted(set(request.arguments) - {"size", "configuration"}):
+        raise ValueError(f"arguments: unknown {unknown}; they are size and configuration.")
+    size, own = request.arguments.get("size", "12M"), request.arguments.get("configuration", {})
+    if size not in SIZES:
+        raise ValueError(f"arguments, size: must be one of {SIZES}, got {size!r}.")
+    settings = settings_of(request)
+    if taken := sorted(set(own) & set(settings)):
+        raise ValueError(f"arguments, configuration: {taken} follow from the run's settings.")
+    named = {"exp": "dreamer_v3_5", "algo": "dreamer_v3_5" if size == "200M" else f"dreamer_v3_5_{size}", "env": "default"}
+    words = [f"{name}={value}" for name, value in named.items()]
+    return words + [f"{name}={in_hydra(value)}" for name, value in {**own, **settings}.items()]
+
+
+def in_hydra(value: Any) -> str:
+    """
+    :param value: number, text, ``None``, or a list or mapping of such
+    :return: in the grammar of Hydra's command line
+    """
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{in_hydra(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(map(in_hydra, value)) + "]"
+    return json.dumps(value)
+
+
+def settings_of(request: Request) -> dict[str, Any]:
+    """
+    :param request: of the run
+    :return: sheeprl's settings that follow from it
+    """
+    spec, path, logs = request.spec, str(request.path), request.checkpoint / "sheeprl"
+    callbacks = [
+        {"_target_": "benchmarks.dreamer.Evaluation", "request": path},
+        {"_target_": "sheeprl.utils.callback.CheckpointCallback", "keep_last": 2},
+    ]
+    checkpoints = sorted(logs.rglob("*.ckpt"), key=lambda checkpoint: checkpoint.stat().st_mtime)
+    return {
+        "env.id": spec.cell,
+        "env.num_envs": spec.envs,
+        "env.sync_env": True,
+        "env.capture_video": False,
+        "env.wrapper": {"_target_": "benchmarks.dreamer.make_env", "request": path},
+        "fabric.callbacks": callbacks,
+        "algo.mlp_keys.encoder": [KEY],
+        "algo.cnn_keys.encoder": [],
+        "algo.total_steps": max(spec.steps, request.evaluations[-1]),
+        "algo.run_test": False,
+        "buffer.size": min(LARGEST_BUFFER, 2 * max(spec.steps, 1_000)),  # an episode's last observation has a place too
+        "checkpoint.every": request.evaluations[0],
+        "checkpoint.save_last": False,
+        "checkpoint.resume_from": str(checkpoints[-1]) if checkpoints else None,
+        "seed": spec.seed,
+        "log_root": str(logs),
+        "root_dir": ".",
+        "run_name": "run",
+        "hydra.run.dir": str(logs / "hydra"),
+    }
+
+
+def main() -> None:
+    """Command line: the path of a request."""
+    request = Request(sys.argv[1])
+    sys.argv = ["sheeprl", *command_line(request)]
+    print(" ".join(sys.argv), flush=True)
+    run_sheeprl()
+    keep_logs(request.checkpoint, request.path.parent / "tensorboard")
+
+
+def keep_logs(checkpoint: Path, directory: Path) -> None:
+    """
+    :param checkpoint: directory that is removed when the run is finished
+    :param directory: where its TensorBoard logs go
+    """
+    directory.mkdir(exist_ok=True)
+    for log in sorted(checkpoint.rglob("events.out.tfevents.*")):
+        shutil.copy(log, directory)
+
+
+if __name__ == "__main__":
+    main()

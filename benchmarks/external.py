@@ -1,0 +1,179 @@
+"""
+An algorithm that is a program of its own, with whatever interpreter, language and packages it takes: an entry such as ::
+
+    mine: {class: "benchmarks.external:Program", command: [python, -m, my_module], packages: [my-package], arguments: {a: 1}}
+
+The program is started in the checkout, with the path of ``request.json`` in the run's directory as its last argument: ``run``
+(the run's settings), ``environment`` (``id``, ``kwargs``, ``wrappers``), ``evaluations`` (environment steps at which it
+evaluates), ``eval_seed`` (what the evaluation environments are seeded with before each one), ``arguments`` (its own) and
+``path`` (where the environment's modules may be, beside all that is on Python's path).
+
+It writes ``checkpoint/evaluations.csv`` beside the request, anew and in one move after every evaluation: ``timesteps``,
+``learner`` (the mean return) and whatever other numbers, one row for each of ``evaluations``. Then it ends with status 0.
+``checkpoint`` is its own to go on from when it is started again, and is removed when the run is finished; what is beside it
+stays. :mod:`benchmarks.program` does all of this for programs in Python.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar
+
+from benchmarks.checkpoint import CHECKPOINT, TIMING, read_seconds, write_atomically, write_timing
+from benchmarks.engines import end_with_parent
+from benchmarks.environments import EVAL_SEED, environment
+from benchmarks.program import REQUEST, Rows, read_rows
+from benchmarks.suite import HERE, RunSpec, check_is
+
+_ASK = """
+import json, platform, sys
+from importlib.metadata import PackageNotFoundError, version
+found = {"python": platform.python_version()}
+for name in sys.argv[1:]:
+    try:
+        found[name] = version(name)
+    except PackageNotFoundError:
+        found[name] = None
+print(json.dumps(found))
+"""
+_LOOK_EVERY = 1.0  # seconds
+
+
+class Program:
+    """
+    What stands where other algorithms have their class.
+
+    :param command: its words; ``python`` as the first one is the interpreter
+    :param python: environment variable with the path of that interpreter; without one, or where it is not set, this process's
+    :param packages: distributions that the interpreter must have, whose versions are recorded
+    :param arguments: of the program
+    :raises ValueError: naming an argument that is something else
+    """
+
+    #: For those who ask algorithms
+    policy_aliases: ClassVar[Mapping[str, type]] = {}
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        python: str | None = None,
+        packages: Sequence[str] = (),
+        arguments: Mapping[str, Any] | None = None,
+    ):
+        check_is("command", command, "a list of words, such as [python, -m, my_module]", list, len)
+        check_is("python", python, "the name of an environment variable", (str, type(None)))
+        check_is("packages", packages, "a list of names", (list, tuple))
+        check_is("arguments", arguments, "a mapping", (Mapping, type(None)))
+        for words in (command, packages):
+            check_is("command and packages", words, "lists of text", (list, tuple), lambda words: _are_texts(words))
+        self._words, self._packages, self._arguments = command, packages, dict(arguments or {})
+        self._variable = python
+
+    @property
+    def interpreter(self) -> str:
+        """Which ``python`` is meant."""
+        return os.environ.get(self._variable or "") or sys.executable
+
+    @property
+    def command(self) -> list[str]:
+        """All words but the last."""
+        first, *others = self._words
+        return [self.interpreter if first == "python" else first, *others]
+
+    def versions(self) -> dict[str, str]:
+        """
+        :return: of the interpreter and the packages; nothing, if the program needs no packages
+        :raises ValueError: saying what is not installed, and where
+        """
+        if not self._packages:
+            return {}
+        is_named = bool(os.environ.get(self._variable or ""))
+        where = f"the interpreter that {self._variable} names" if is_named else "this interpreter"
+        try:
+            asked = subprocess.run([self.interpreter, "-c", _ASK, *self._packages], capture_output=True, text=True, check=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            raise ValueError(f"{where}, {self.interpreter}, can't be run: {error}") from None
+        versions: dict[str, str] = json.loads(asked.stdout)
+        if missing := [name for name in self._packages if versions[name] is None]:
+            other = f", or set {self._variable} to the path of one that has them" if self._variable else ""
+            raise ValueError(f"{where}, {self.interpreter}, lacks {missing}: install them there{other}.")
+        return versions
+
+    def run(self, spec: RunSpec, directory: Path) -> Rows:
+        """
+        :param spec: of the run
+        :param directory: of the run, which nobody else uses
+        :return: one row per evaluation
+        :raises RuntimeError: if the program fails, or ends without all of them
+        """
+        (directory / CHECKPOINT).mkdir(exist_ok=True)
+        write_atomically(directory / REQUEST, json.dumps(request_of(spec, self._arguments), indent=1))
+        command = [*self.command, str((directory / REQUEST).resolve())]
+        rows, times = _watch(command, directory), evaluation_times(spec)
+        if (found := [row["timesteps"] for row in rows]) != times:
+            raise RuntimeError(f"{command} ended with evaluations at {found} steps, not at {times}.")
+        return rows
+
+
+def request_of(spec: RunSpec, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param spec: of a run
+    :param arguments: of the program
+    :return: what it is asked for
+    """
+    env_id, kwargs = environment(spec)
+    wrappers = spec.environment["wrappers"] if spec.environment else []
+    return {
+        "run": asdict(spec),
+        "environment": {"id": env_id, "kwargs": kwargs, "wrappers": wrappers},
+        "evaluations": evaluation_times(spec),
+        "eval_seed": EVAL_SEED,
+        "arguments": arguments,
+        "path": _own_places(),
+    }
+
+
+def _watch(command: list[str], directory: Path) -> Rows:
+    """Run it to its end, with ``timing.json`` for its last evaluation at any time; all of its evaluations."""
+    rows, started = read_rows(directory), time.time()
+    before = read_seconds(directory / TIMING) if rows else 0.0
+    path = os.pathsep.join(filter(None, [str(HERE.parent), os.environ.get("PYTHONPATH")]))
+    process = subprocess.Popen(command, cwd=HERE.parent, env={**os.environ, "PYTHONPATH": path}, preexec_fn=end_with_parent)
+    status = None
+    while status is None:
+        with suppress(subprocess.TimeoutExpired):
+            status = process.wait(_LOOK_EVERY)
+        if (now := read_rows(directory)) and now != rows:
+            rows = now
+            seconds = before + time.time() - started
+            write_timing(directory / TIMING, seconds, int(rows[-1]["timesteps"]), rows[-1]["learner"])
+    if status:
+        raise RuntimeError(f"{command} ended with status {status}.")
+    return rows
+
+
+def _are_texts(words: Sequence[Any]) -> bool:
+    return all(isinstance(word, str) for word in words)
+
+
+def _own_places() -> list[str]:
+    """Where modules are found that are no part of this interpreter's installation, such as those beside a suite."""
+    installed = {Path(prefix).resolve() for prefix in (sys.prefix, sys.base_prefix)}
+    places = [Path(place).resolve() for place in sys.path if place]
+    return [str(place) for place in places if not any(place.is_relative_to(prefix) for prefix in installed)]
+
+
+def evaluation_times(spec: RunSpec) -> list[int]:
+    """
+    :param spec: of a run
+    :return: environment steps at which every algorithm is evaluated: after whole steps of all environments
+    """
+    every = spec.eval_every // spec.envs * spec.envs
+    end = -(-spec.steps // spec.envs) * spec.envs
+    return list(range(every, end + 1, every))

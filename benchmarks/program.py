@@ -1,0 +1,106 @@
+"""What a program in Python that trains for :mod:`benchmarks.external` is asked for, and how it answers."""
+
+import csv
+import io
+import json
+import sys
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv
+
+from benchmarks.checkpoint import CHECKPOINT, write_atomically
+from benchmarks.environments import make_envs, make_wrapped
+from benchmarks.suite import RunSpec
+
+REQUEST, EVALUATIONS = "request.json", "evaluations.csv"
+#: One mapping per evaluation: ``timesteps``, ``learner``, and others
+Rows: TypeAlias = list[dict[str, float]]
+
+
+def read_rows(directory: Path) -> Rows:
+    """
+    :param directory: of a run
+    :return: its program's evaluations so far
+    :raises ValueError: if there is something else in their place
+    """
+    path = directory / CHECKPOINT / EVALUATIONS
+    if not path.exists():
+        return []
+    try:
+        with path.open(newline="") as file:
+            rows = [{name: float(text) for name, text in row.items()} for row in csv.DictReader(file)]
+        return [{**row, "timesteps": int(row["timesteps"]), "learner": row["learner"]} for row in rows]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: each row must have the numbers timesteps and learner ({error!r}).") from None
+
+
+def rows_as_text(rows: Rows) -> str:
+    """
+    :param rows: at least one
+    :return: as a CSV file
+    """
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, rows[-1].keys(), restval="nan")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+class Request:
+    """
+    :param path: of ``request.json``
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        asked = json.loads(self.path.read_text())
+        #: The run's settings
+        self.spec = RunSpec(**asked["run"])
+        #: The program's own
+        self.arguments: dict[str, Any] = asked["arguments"]
+        #: Environment steps at which it evaluates
+        self.evaluations: list[int] = asked["evaluations"]
+        #: Evaluations so far
+        self.rows = read_rows(self.path.parent)
+        sys.path += [place for place in asked["path"] if place not in sys.path]
+        #: What the evaluation environments are seeded with
+        self.eval_seed: int = asked["eval_seed"]
+        self._environment = asked["environment"]
+        self._eval_env: VecEnv | None = None
+
+    @property
+    def checkpoint(self) -> Path:
+        """Directory of what the program goes on from, which is removed when the run is finished."""
+        return self.path.parent / CHECKPOINT
+
+    def make_env(self) -> gym.Env:
+        """One of the run's environments, without a seed."""
+        return make_wrapped(self._environment["id"], self._environment["kwargs"], self._environment["wrappers"])
+
+    def go_on_from(self, timesteps: int) -> None:
+        """
+        :param timesteps: of the program's last checkpoint: evaluations after it will be made again
+        """
+        self.rows = [row for row in self.rows if row["timesteps"] <= timesteps]
+
+    def evaluate(self, timesteps: int, policy: Any) -> float:
+        """
+        Evaluate as all algorithms are: the same environments, seeds, and number of episodes. Writes the row.
+
+        :param timesteps: so far, one of ``evaluations``
+        :param policy: with SB3's ``predict(observation, state, episode_start, deterministic)``
+        :return: mean return
+        """
+        if self._eval_env is None:
+            self._eval_env = make_envs(self.spec, self.spec.eval_episodes)
+        self._eval_env.seed(self.eval_seed)
+        returns, _ = evaluate_policy(
+            policy, self._eval_env, n_eval_episodes=self.spec.eval_episodes, return_episode_rewards=True
+        )
+        self.rows.append({"timesteps": timesteps, "learner": float(np.mean(returns))})
+        write_atomically(self.checkpoint / EVALUATIONS, rows_as_text(self.rows))
+        return self.rows[-1]["learner"]
