@@ -3,7 +3,7 @@
 import warnings
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sb3_gac.envs.actions import FlattenMultiDiscrete
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
@@ -14,15 +14,27 @@ from sb3_gac.envs.suites.pendulum import make_pendulum
 from sb3_gac.envs.suites.popgym import make_popgym
 from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDictObservation, SplitObservation
 
+if TYPE_CHECKING:
+    from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv
+    from sb3_gac.envs.vector.registry import make_vec
+
 take_along()
 for _suite in SUITES:
     register(_suite)
 
+#: Name -> module that has it and imports SB3, and with it torch, which the other environments do without
+_VECTOR = {
+    "BatchStep": "sb3_gac.envs.vector.base",
+    "BatchVecEnv": "sb3_gac.envs.vector.base",
+    "make_vec": "sb3_gac.envs.vector.registry",
+}
 _FORMER = ("mujoco", "pendulum", "popgym")
 
 
 def __getattr__(name: str) -> Any:
-    """Names of earlier versions, for one release."""
+    """Vectorised environments, when they are first used; and names of earlier versions, for one release."""
+    if name in _VECTOR:
+        return getattr(import_module(_VECTOR[name]), name)
     if name in _FORMER:
         return import_module(f"{__name__}.{name}")
     suite = name.removeprefix("register_")
@@ -35,6 +47,8 @@ def __getattr__(name: str) -> Any:
 __all__ = [
     "PARTIAL",
     "PRIVILEGED",
+    "BatchStep",
+    "BatchVecEnv",
     "FlattenMultiDiscrete",
     "History",
     "PreviousAction",
@@ -44,4 +58,5 @@ __all__ = [
     "make_mujoco",
     "make_pendulum",
     "make_popgym",
+    "make_vec",
 ]

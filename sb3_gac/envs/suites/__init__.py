@@ -2,10 +2,18 @@
 The registered environments, suite by suite: one table.
 
 A suite is a module with ``ENVIRONMENTS``, from ids to what ``gymnasium.register`` takes.  It imports its simulator when an
-environment is made, and says with :func:`~sb3_gac.envs.suites.extras.import_extra` how to install it.
+environment is made, and says with :func:`~sb3_gac.envs.suites.extras.import_extra` how to install it.  Beside gymnasium's own
+arguments there may be
+
+``vec_entry_point``
+    in the place of ``entry_point``, where the simulator steps many environments at once: ``module:function``, which takes
+    ``n_envs`` and the ``kwargs``, and returns SB3's ``VecEnv``.  ``gymnasium.make`` makes one environment of it.
+``whole_state``
+    whether the privileged entry has all that ``partial`` shows, so that critics need nothing else; by default, what the suite
+    says.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -31,6 +39,17 @@ class Suite(NamedTuple):
         found: Mapping[str, Mapping[str, Any]] = import_module(self.module).ENVIRONMENTS
         return found
 
+    def shows_whole_state(self, env_id: str) -> bool:
+        """
+        :param env_id: of one of its environments
+        :return: whether the privileged entry has all that ``partial`` shows
+        """
+        return bool(self.environments[env_id].get("whole_state", self.sensor_noise))
+
+
+#: Arguments of an environment that are this package's, not gymnasium's
+_OWN = ("vec_entry_point", "whole_state")
+_SINGLE = "sb3_gac.envs.vector.single:make_single"
 
 SUITES = {
     "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True),
@@ -44,7 +63,10 @@ def register(suite: str) -> None:
     :param suite: a key of ``SUITES``, whose environments gymnasium is to know
     """
     for env_id, arguments in SUITES[suite].environments.items():
-        gym.register(env_id, **arguments)
+        of_gymnasium = {name: value for name, value in arguments.items() if name not in _OWN}
+        if "vec_entry_point" in arguments:
+            of_gymnasium |= {"entry_point": _SINGLE, "kwargs": {"env_id": env_id}}
+        gym.register(env_id, **of_gymnasium)
 
 
 def suite_of(env_id: str) -> str | None:
@@ -53,6 +75,28 @@ def suite_of(env_id: str) -> str | None:
     :return: the suite that has it, ``None`` if it is none of this package's
     """
     return next((name for name, suite in SUITES.items() if env_id in suite.environments), None)
+
+
+def is_batched(env_id: str) -> bool:
+    """
+    :param env_id: of an environment
+    :return: whether it is of a suite whose simulator steps many environments at once
+    """
+    suite = suite_of(env_id)
+    return suite is not None and "vec_entry_point" in SUITES[suite].environments[env_id]
+
+
+def batch_factory(env_id: str) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """
+    :param env_id: of an environment that :func:`is_batched`
+    :return: what makes vectorised environments, given ``n_envs``, and the task's keyword arguments of it
+    :raises ValueError: if its simulator steps one environment at a time
+    """
+    if not is_batched(env_id):
+        raise ValueError(f"env_id must be of a suite whose simulator steps a batch, got {env_id!r}.")
+    arguments = SUITES[suite_of(env_id) or ""].environments[env_id]
+    module, _, function = arguments["vec_entry_point"].partition(":")
+    return getattr(import_module(module), function), dict(arguments.get("kwargs", {}))
 
 
 def task_of(env_id: str) -> str:
