@@ -80,8 +80,9 @@ class BatchVecEnv(VecEnv):
         self._partial = BatchSelection(PARTIAL, partial, observation_space)
         self._privileged = BatchSelection(PRIVILEGED, privileged, observation_space)
         self.time_limit, self.noise_std = time_limit, check_noise_std(noise_std, self._partial.space, PARTIAL)
-        entries: dict[str, spaces.Space] = {PARTIAL: noisy_box(self._partial.space, self.noise_std), PRIVILEGED: self._privileged.space}
-        super().__init__(int(n_envs), spaces.Dict(entries), _in_float32(action_space))
+        noisy = noisy_box(self._partial.space, self.noise_std)
+        space = spaces.Dict({PARTIAL: noisy, PRIVILEGED: self._privileged.space})
+        super().__init__(int(n_envs), space, _in_float32(action_space))
         self._is_noisy, self._noise = bool((self.noise_std > 0).any()), np.random.default_rng()
         self._lengths, self._returns = np.zeros(self.num_envs, dtype=np.int64), np.zeros(self.num_envs)
         self._has_started, self._created = False, time.time()
