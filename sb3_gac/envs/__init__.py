@@ -16,6 +16,7 @@ from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDic
 
 if TYPE_CHECKING:
     from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv
+    from sb3_gac.envs.vector.envpool import EnvPoolVecEnv
     from sb3_gac.envs.vector.registry import make_vec
 
 take_along()
@@ -26,6 +27,7 @@ for _suite in SUITES:
 _VECTOR = {
     "BatchStep": "sb3_gac.envs.vector.base",
     "BatchVecEnv": "sb3_gac.envs.vector.base",
+    "EnvPoolVecEnv": "sb3_gac.envs.vector.envpool",
     "make_vec": "sb3_gac.envs.vector.registry",
 }
 _FORMER = ("mujoco", "pendulum", "popgym")
@@ -49,6 +51,7 @@ __all__ = [
     "PRIVILEGED",
     "BatchStep",
     "BatchVecEnv",
+    "EnvPoolVecEnv",
     "FlattenMultiDiscrete",
     "History",
     "PreviousAction",

@@ -25,7 +25,8 @@ class Suite(NamedTuple):
     Environments that belong together.
 
     :param module: has them
-    :param sensor_noise: whether they take ``noise_std``, and their privileged entry is the whole state
+    :param sensor_noise: whether they take ``noise_std``, and, if an environment does not say otherwise, their privileged entry
+        has the whole state
     :param extra: of this package, with which their simulator is installed; ``None`` where it always is
     """
 
@@ -55,6 +56,7 @@ SUITES = {
     "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True),
     "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
+    "playground": Suite("sb3_gac.envs.suites.playground", sensor_noise=True, extra="envpool"),
 }
 
 
