@@ -226,7 +226,7 @@ def test_environments_side_by_side_are_those_alone(real):
             assert (rewards[index], dones[index]) == (its_reward[0], its_done[0])
             assert infos[index].get("TimeLimit.truncated") == its_info[0].get("TimeLimit.truncated")
             ends += its_done[0]
-        assert ends >= 2
+        assert ends >= 1
 
 
 def test_noise_of_our_own_leaves_the_simulation_alone(real):
