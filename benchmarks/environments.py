@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.suite import RunSpec
 from sb3_gac.algorithms import import_path
+from sb3_gac.envs import make_vec
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 
 
@@ -40,7 +41,7 @@ def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:
     """
     env_id, kwargs = environment(spec)
     if spec.environment is None:
-        return make_vec_env(env_id, n_envs, seed=seed, env_kwargs=kwargs)
+        return make_vec(env_id, n_envs, seed, **kwargs)
     # What counts returns goes around the wrappers: one of them may change rewards, or end episodes
     return make_vec_env(partial(make_wrapped, env_id, kwargs, spec.environment["wrappers"]), n_envs, seed=seed)
 

@@ -8,6 +8,9 @@ arguments there may be
 ``vec_entry_point``
     in the place of ``entry_point``, where the simulator steps many environments at once: ``module:function``, which takes
     ``n_envs`` and the ``kwargs``, and returns SB3's ``VecEnv``.  ``gymnasium.make`` makes one environment of it.
+``shapes``
+    of the entries and of the actions, ``{"partial": (48,), "privileged": (123,), "action": (12,)}``, so that they are known
+    without the simulator.
 ``whole_state``
     whether the privileged entry has all that ``partial`` shows, so that critics need nothing else; by default, what the suite
     says.
@@ -15,6 +18,7 @@ arguments there may be
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -28,17 +32,29 @@ class Suite(NamedTuple):
     :param sensor_noise: whether they take ``noise_std``, and, if an environment does not say otherwise, their privileged entry
         has the whole state
     :param extra: of this package, with which their simulator is installed; ``None`` where it always is
+    :param simulator: module that it is then found by, by default of the extra's name
+    :param preset: with which ``python -m sb3_gac.train`` trains on them
+    :param noise_std: with which it does, 0 where sensors are noisy without
     """
 
     module: str
     sensor_noise: bool = False
     extra: str | None = None
+    simulator: str | None = None
+    preset: str = "small"
+    noise_std: float = 0.1
 
     @property
     def environments(self) -> Mapping[str, Mapping[str, Any]]:
         """Id -> arguments of ``gymnasium.register``."""
         found: Mapping[str, Mapping[str, Any]] = import_module(self.module).ENVIRONMENTS
         return found
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether its simulator is there; it is not imported."""
+        module = self.simulator or self.extra
+        return module is None or find_spec(module) is not None
 
     def shows_whole_state(self, env_id: str) -> bool:
         """
@@ -49,14 +65,16 @@ class Suite(NamedTuple):
 
 
 #: Arguments of an environment that are this package's, not gymnasium's
-_OWN = ("vec_entry_point", "whole_state")
+_OWN = ("vec_entry_point", "shapes", "whole_state")
 _SINGLE = "sb3_gac.envs.vector.single:make_single"
 
 SUITES = {
     "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True),
     "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
-    "playground": Suite("sb3_gac.envs.suites.playground", sensor_noise=True, extra="envpool"),
+    "playground": Suite(
+        "sb3_gac.envs.suites.playground", sensor_noise=True, extra="envpool", preset="playground", noise_std=0.0
+    ),
 }
 
 
@@ -77,6 +95,18 @@ def suite_of(env_id: str) -> str | None:
     :return: the suite that has it, ``None`` if it is none of this package's
     """
     return next((name for name, suite in SUITES.items() if env_id in suite.environments), None)
+
+
+def env_id_of(task: str) -> str:
+    """
+    :param task: see :func:`task_of`
+    :return: the environment that it is the task of
+    :raises ValueError: if there is none
+    """
+    ids = {task_of(env_id): env_id for suite in SUITES.values() for env_id in suite.environments}
+    if task not in ids:
+        raise ValueError(f"task must be one of {sorted(ids)}, got {task!r}.")
+    return ids[task]
 
 
 def is_batched(env_id: str) -> bool:

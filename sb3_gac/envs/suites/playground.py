@@ -8,6 +8,7 @@ MuJoCo Playground: robots and hands whose designers drew the line between what a
 
 from typing import Any, NamedTuple
 
+from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.suites.extras import import_extra
 
 
@@ -72,6 +73,7 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
     f"sb3_gac/{task}-v0": {
         "vec_entry_point": f"{__name__}:make_playground",
         "kwargs": {"task": task},
+        "shapes": {PARTIAL: (robot.partial,), PRIVILEGED: (robot.privileged,), "action": (robot.actions,)},
     }
-    for task in TASKS
+    for task, robot in TASKS.items()
 }

@@ -83,6 +83,8 @@ class BatchVecEnv(VecEnv):
         noisy = noisy_box(self._partial.space, self.noise_std)
         space = spaces.Dict({PARTIAL: noisy, PRIVILEGED: self._privileged.space})
         super().__init__(int(n_envs), space, _in_float32(action_space))
+        actions = self.action_space
+        self._bounds = (actions.low, actions.high) if isinstance(actions, spaces.Box) else None
         self._is_noisy, self._noise = bool((self.noise_std > 0).any()), np.random.default_rng()
         self._lengths, self._returns = np.zeros(self.num_envs, dtype=np.int64), np.zeros(self.num_envs)
         self._has_started, self._created = False, time.time()
@@ -155,8 +157,9 @@ class BatchVecEnv(VecEnv):
         """
         if not self._has_started:
             raise RuntimeError(f"{type(self).__name__} must be reset before its first step.")
-        space = self.action_space
-        self._actions = np.clip(actions, space.low, space.high) if isinstance(space, spaces.Box) else actions
+        if self._bounds is not None:  # np.clip takes twice as long
+            actions = np.minimum(np.maximum(actions, self._bounds[0]), self._bounds[1])
+        self._actions = actions
 
     def step_wait(self) -> tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """
@@ -174,7 +177,7 @@ class BatchVecEnv(VecEnv):
         for name, of_all in values.items():
             for info, value in zip(infos, of_all, strict=True):
                 info[name] = value
-        if dones.any():
+        if np.count_nonzero(dones):
             self._end_episodes(np.flatnonzero(dones), ~terminated, observation, infos)
         return observation, rewards.astype(np.float32), dones, infos
 

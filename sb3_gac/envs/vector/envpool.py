@@ -64,7 +64,8 @@ class EnvPoolVecEnv(BatchVecEnv):
         self._envpool = import_extra("envpool", "envpool", task_id)
         self.task_id, self._kwargs, self.info_keys = task_id, kwargs, tuple(info_keys)
         specification = self._specification()
-        self._pool: Any = None
+        #: EnvPool's own, from the first reset on
+        self.pool: Any = None
         super().__init__(
             n_envs,
             specification.gymnasium_observation_space,
@@ -89,8 +90,8 @@ class EnvPoolVecEnv(BatchVecEnv):
     def start(self, seeds: Sequence[int]) -> SimulatorObservation:
         """See :meth:`BatchVecEnv.start`."""
         assert self.time_limit is not None
-        self._pool = None  # the one before need not be there beside it
-        self._pool = self._envpool.make(
+        self.pool = None  # the one before need not be there beside it
+        self.pool = self._envpool.make(
             self.task_id,
             env_type="gymnasium",
             num_envs=self.num_envs,
@@ -103,12 +104,12 @@ class EnvPoolVecEnv(BatchVecEnv):
 
     def restart(self, indices: np.ndarray) -> SimulatorObservation:
         """See :meth:`BatchVecEnv.restart`."""
-        observation, info = self._pool.reset(indices.astype(np.int32))
+        observation, info = self.pool.reset(indices.astype(np.int32))
         return _in_order(observation, np.argsort(info["env_id"]))
 
     def advance(self, actions: np.ndarray) -> BatchStep:
         """See :meth:`BatchVecEnv.advance`."""
-        observation, rewards, terminated, truncated, info = self._pool.step(actions)
+        observation, rewards, terminated, truncated, info = self.pool.step(actions)
         infos = {name: self._info(info, name) for name in self.info_keys}
         return BatchStep(observation, rewards, terminated, truncated, infos)
 
@@ -125,7 +126,7 @@ class EnvPoolVecEnv(BatchVecEnv):
 
     def close(self) -> None:
         """Free the simulators."""
-        self._pool = None
+        self.pool = None
 
 
 def _in_order(observation: Any, order: np.ndarray) -> SimulatorObservation:
