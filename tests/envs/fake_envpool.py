@@ -2,8 +2,8 @@
 What of EnvPool its adapter meets, in Python, with the same traps.
 
 A pool's random numbers depend on the seeds that it was built with; a step after an end begins the next episode, ignores its
-action and has reward 0; ``done`` with ``trunc`` is never ``terminated``; a reset returns the rows that were asked for, here in
-an order of its own, which ``info["env_id"]`` tells; all is in double precision.
+action and has reward 0; ``done`` at the limit is told with ``trunc``, a fall or not; a reset returns the rows that were asked
+for, here in an order of its own, which ``info["env_id"]`` tells; all is in double precision.
 """
 
 from types import SimpleNamespace
@@ -69,7 +69,16 @@ class Pool:
             self._begin(index)
         return self._rows(env_id[::-1])
 
-    def step(self, actions):
+    @property
+    def _state_keys(self):
+        of_observation = ["obs"] if self.flat else ["obs:state", "obs:privileged_state"]
+        return [*of_observation, "reward", "done", "trunc", *(f"info:{name}" for name in ("env_id", "elapsed_step", "height"))]
+
+    def _recv(self):
+        observation, info = self._rows(np.arange(self.n))
+        return [*([observation] if self.flat else observation.values()), *self.returned, *info.values()]
+
+    def send(self, actions):
         assert np.abs(actions).max() <= 1
         rewards = np.zeros(self.n)
         trunc = np.zeros(self.n, dtype=bool)
@@ -82,5 +91,4 @@ class Pool:
             rewards[index] = self.scale * self.acted[index]
             trunc[index] = self.elapsed[index] >= self.limit
             self.done[index] = trunc[index] or self.elapsed[index] == FALL + index
-        observation, info = self._rows(np.arange(self.n))
-        return observation, rewards, self.done & ~trunc, trunc, info
+        self.returned = rewards, self.done.copy(), trunc

@@ -86,7 +86,9 @@ class BatchVecEnv(VecEnv):
         actions = self.action_space
         self._bounds = (actions.low, actions.high) if isinstance(actions, spaces.Box) else None
         self._is_noisy, self._noise = bool((self.noise_std > 0).any()), np.random.default_rng()
-        self._lengths, self._returns = np.zeros(self.num_envs, dtype=np.int64), np.zeros(self.num_envs)
+        #: Steps so far, and those after which the episodes began: no array is touched before one may be over its limit
+        self._n_steps, self._begun, self._first_begun = 0, np.zeros(self.num_envs, dtype=np.int64), 0
+        self._returns = np.zeros(self.num_envs)
         self._has_started, self._created = False, time.time()
         self._actions: np.ndarray | None = None
 
@@ -147,7 +149,7 @@ class BatchVecEnv(VecEnv):
             self._noise = np.random.default_rng([self._seeds[0], NOISE_STREAM])
         self._has_started = True
         self._reset_seeds()
-        self._lengths[:], self._returns[:] = 0, 0.0
+        self._begin(np.arange(self.num_envs))
         return self._observed(raw)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -167,10 +169,10 @@ class BatchVecEnv(VecEnv):
         """
         assert self._actions is not None
         raw, rewards, terminated, truncated, values = self.advance(self._actions)
-        self._lengths += 1
+        self._n_steps += 1
         self._returns += rewards
-        if self.time_limit is not None:
-            truncated = truncated | (self._lengths >= self.time_limit)
+        if self.time_limit is not None and self._n_steps - self._first_begun >= self.time_limit:
+            truncated = truncated | (self._n_steps - self._begun >= self.time_limit)
         dones = terminated | truncated
         observation = self._observed(raw)
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
@@ -191,12 +193,16 @@ class BatchVecEnv(VecEnv):
             infos[index]["terminal_observation"] = {key: values[index].copy() for key, values in observation.items()}
             infos[index]["episode"] = {
                 "r": round(float(self._returns[index]), 6),
-                "l": int(self._lengths[index]),
+                "l": self._n_steps - int(self._begun[index]),
                 "t": seconds,
             }
-        self._lengths[ended], self._returns[ended] = 0, 0.0
+        self._begin(ended)
         for key, values in self._observed(self.restart(ended)).items():
             observation[key][ended] = values
+
+    def _begin(self, indices: np.ndarray) -> None:
+        self._begun[indices], self._returns[indices] = self._n_steps, 0.0
+        self._first_begun = int(self._begun.min())
 
     def _observed(self, raw: SimulatorObservation) -> Observations:
         partial = self._partial.of(raw)
@@ -256,7 +262,8 @@ class BatchVecEnv(VecEnv):
         :return: what the next steps depend on
         :raises NotRestorableError: if the simulator's state can't be had
         """
-        own = {"lengths": self._lengths, "returns": self._returns, "noise": self._noise, "has_started": self._has_started}
+        lengths = self._n_steps - self._begun
+        own = {"lengths": lengths, "returns": self._returns, "noise": self._noise, "has_started": self._has_started}
         return {"simulator": self.simulator_state(), **deepcopy(own)}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -265,8 +272,10 @@ class BatchVecEnv(VecEnv):
         :raises NotRestorableError: if the simulator can't be put back
         """
         self.restore_simulator_state(state["simulator"])
-        self._lengths, self._returns, self._noise = state["lengths"], state["returns"], state["noise"]
-        self._has_started = state["has_started"]
+        self._begin(np.arange(self.num_envs))
+        self._begun -= state["lengths"]
+        self._first_begun = int(self._begun.min())
+        self._returns, self._noise, self._has_started = state["returns"], state["noise"], state["has_started"]
 
 
 def _in_float32(space: spaces.Space) -> spaces.Space:
