@@ -29,7 +29,10 @@ def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
     takes_noise = suite is None or SUITES[suite].sensor_noise
     if spec.noise and not takes_noise:
         raise ValueError(f"{spec.task} has no sensor noise: give noises: [0].")
-    return ids[spec.task], {"noise_std": spec.noise} if takes_noise else {}
+    if spec.history and not (suite is None or SUITES[suite].history):
+        raise ValueError(f"{spec.task} takes no history: leave it out, and give networks a memory.")
+    history = {} if spec.history is None else {"history": spec.history}
+    return ids[spec.task], {"noise_std": spec.noise, **history} if takes_noise else {}
 
 
 def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:

@@ -2,6 +2,7 @@
 Train GAC on a task with noisy sensors, then evaluate the learner on its partial observation alone::
 
     python -m sb3_gac.train --task HalfCheetah --noise 0.1 --steps 50000 --seed 0
+    python -m sb3_gac.train --history 4    # the learner sees the last four observations, and the actions between them
 
 Everything is saved under ``runs/``: the model, the learning curve as a picture, the evaluations and the resolved
 configuration.  A run that was stopped, by Ctrl-C or otherwise, goes on from its last checkpoint, and ends as it would have
@@ -79,6 +80,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         "--noise", type=float, help="standard deviation of the sensor noise, by default 0.1, or 0 where sensors have their own"
     )
     parser.add_argument("--privileged", default="state", choices=["state", "velocity"])
+    parser.add_argument(
+        "--history", type=int, default=1, help="noisy observations that the learner sees, with the actions between"
+    )
     parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--envs", type=int, help="environments side by side, by default as many as the preset is for")
@@ -98,6 +102,8 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     suite = suite_with(options.task)
     options.noise = suite.noise_std if options.noise is None else options.noise
     options.preset = options.preset or suite.preset
+    if options.history != 1 and not suite.history:
+        parser.error(f"--history: {options.task} takes none.")
     options.envs = options.envs or PRESETS[options.preset].envs
     return options
 
@@ -120,9 +126,9 @@ def options_of(directory: Path) -> argparse.Namespace:
         raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
     if not checkpoints(directory / CHECKPOINTS):
         raise ValueError(f"--resume {directory}: there is no checkpoint in {directory / CHECKPOINTS}; start the run again.")
-    names = vars(parse_arguments([]))
+    defaults = vars(parse_arguments([]))
     configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
-    options = {name: configuration[name] for name in names if name != "resume"}
+    options = {name: configuration.get(name, default) for name, default in defaults.items() if name != "resume"}
     return argparse.Namespace(**options | {"runs": Path(options["runs"]), "resume": directory})
 
 
@@ -134,7 +140,7 @@ def gac_arguments(options: argparse.Namespace) -> dict[str, Any]:
     buffer_size = min(1_000_000, max(options.steps, 1_000))
     setting = {"task": options.task, "noise": options.noise}
     arguments = preset(options.preset, **setting, buffer_size=buffer_size, compile=options.compile)
-    if options.privileged != "state" or not suite_with(options.task).shows_whole_state(env_id_of(options.task)):
+    if options.privileged != "state":
         arguments["role_keys"] = None  # without the whole state in one entry, critics need all entries
     return arguments
 
@@ -190,7 +196,8 @@ def start(options: argparse.Namespace) -> Path:
     :param options: see :func:`parse_arguments`
     :return: a new directory for the run, with its configuration
     """
-    name = f"{options.task}-noise{options.noise:g}-seed{options.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    history = "" if options.history == 1 else f"-history{options.history}"
+    name = f"{options.task}-noise{options.noise:g}{history}-seed{options.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     directory = options.runs / name
     directory.mkdir(parents=True)
     configuration = resolved_configuration(options, gac_arguments(options))
@@ -209,6 +216,8 @@ def train(options: argparse.Namespace, directory: Path) -> None:
     env_kwargs = {"noise_std": options.noise}
     if options.privileged != "state":  # which not every suite can change
         env_kwargs["privileged"] = options.privileged
+    if options.history != 1:
+        env_kwargs["history"] = options.history
     env_id = env_id_of(options.task)
     env = make_vec(env_id, options.envs, options.seed, **env_kwargs)
     eval_env = make_vec(env_id, min(5, options.episodes), **env_kwargs)
@@ -275,9 +284,10 @@ def summary(directory: Path) -> str:
     options = yaml.safe_load((directory / "config.yaml").read_text())
     results = json.loads((directory / "results.json").read_text())
     task, noise, episodes = (options[name] for name in ("task", "noise", "episodes"))
+    history = f", history {options['history']}" if options.get("history", 1) > 1 else ""
     learner, random = (f"{results[name]:.0f} +- {results[f'{name}_std']:.0f}" for name in ("learner", "random"))
     return f"""
-Trained GAC on {env_id_of(task)} (noise {noise:g}) for {results["steps"]} steps in {results["minutes"]:.1f} minutes.
+Trained GAC on {env_id_of(task)} (noise {noise:g}{history}) for {results["steps"]} steps in {results["minutes"]:.1f} minutes.
 Learner, seeing `{PARTIAL}` alone: return {learner} over {episodes} episodes.
 Random actions, same seeds: {random}.
 Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:

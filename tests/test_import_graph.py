@@ -31,7 +31,7 @@ FORBIDDEN = {
         for pattern in ("{}.py", "{}/**/*.py")
     },
     "sb3_gac/algorithms.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
-    "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.algorithms\b)",
+    "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.(algorithms|envs\.suites)\b)",
     "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
     "benchmarks/report.py": r"torch\b|sb3_gac\b|benchmarks\b",

@@ -6,12 +6,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sb3_gac.envs.actions import FlattenMultiDiscrete
+from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.subprocesses import take_along
 from sb3_gac.envs.suites import SUITES, register
+from sb3_gac.envs.suites.humanoid_bench import make_humanoid_bench
 from sb3_gac.envs.suites.mujoco import make_mujoco
 from sb3_gac.envs.suites.pendulum import make_pendulum
 from sb3_gac.envs.suites.popgym import make_popgym
+from sb3_gac.envs.suites.robotics import make_robotics
 from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDictObservation, SplitObservation
 
 if TYPE_CHECKING:
@@ -49,6 +52,7 @@ def __getattr__(name: str) -> Any:
 __all__ = [
     "PARTIAL",
     "PRIVILEGED",
+    "AppendDesiredGoal",
     "BatchStep",
     "BatchVecEnv",
     "EnvPoolVecEnv",
@@ -58,8 +62,10 @@ __all__ = [
     "SensorNoise",
     "SplitDictObservation",
     "SplitObservation",
+    "make_humanoid_bench",
     "make_mujoco",
     "make_pendulum",
     "make_popgym",
+    "make_robotics",
     "make_vec",
 ]

@@ -42,8 +42,12 @@ def rows(matching: str = "") -> Iterator[Row]:
     for name, suite in SUITES.items():
         for env_id, arguments in suite.environments.items():
             if matching in env_id:
-                installed = "yes" if suite.is_installed else f'pip install "sb3_gac[{suite.extra}]"'
+                installed = "yes" if suite.is_installed else _how_to_install(suite)
                 yield Row(env_id, name, *_shapes(env_id, suite, arguments.get("shapes")), installed)
+
+
+def _how_to_install(suite: Suite) -> str:
+    return "by hand, docs/environments.md" if suite.extra is None else f'pip install "sb3_gac[{suite.extra}]"'
 
 
 def _shapes(env_id: str, suite: Suite, known: Any) -> tuple[str, str, str]:

@@ -84,10 +84,11 @@ class SplitDictObservation(_SplitWrapper):
     :param partial: keys of what the deployed policy will see; as a mapping, key -> indices into the flattened entry,
         or ``None`` for all of it
     :param privileged: likewise for what only training sees
+    :param keep: keys of entries that stay beside the two, with their shapes, such as the goals that ``HerReplayBuffer`` needs
     :raises ValueError: if the observation is of another kind, or a key or an index is unknown
     """
 
-    def __init__(self, env: gym.Env, partial: KeySelection, privileged: KeySelection):
+    def __init__(self, env: gym.Env, partial: KeySelection, privileged: KeySelection, keep: Sequence[str] = ()):
         super().__init__(env)
         space = env.observation_space
         if not isinstance(space, spaces.Dict):
@@ -96,22 +97,24 @@ class SplitDictObservation(_SplitWrapper):
             PARTIAL: check_keys(PARTIAL, partial, space),
             PRIVILEGED: check_keys(PRIVILEGED, privileged, space),
         }
-        self.observation_space = spaces.Dict(
-            {
-                name: concatenate_boxes([take_from_box(box_entry(space, key), index) for key, index in keys.items()])
-                for name, keys in self._selections.items()
-            }
-        )
+        split = {
+            name: concatenate_boxes([take_from_box(box_entry(space, key), index) for key, index in keys.items()])
+            for name, keys in self._selections.items()
+        }
+        kept = {key: _in_single_precision(box_entry(space, key)) for key in _check_kept(keep)}
+        self._kept = {key: box.dtype for key, box in kept.items()}
+        self.observation_space = spaces.Dict({**split, **kept})
 
     def observation(self, observation: Observation) -> Observation:
         """
         :param observation: of the wrapped environment
-        :return: ``partial`` and ``privileged``, one-dimensional, float32
+        :return: ``partial`` and ``privileged``, one-dimensional, float32; and the entries that stay, of floats float32
         """
-        return {
+        split = {
             name: np.concatenate([np.ravel(observation[key])[index] for key, index in keys.items()], dtype=np.float32)
             for name, keys in self._selections.items()
         }
+        return {**split, **{key: observation[key].astype(dtype) for key, dtype in self._kept.items()}}
 
 
 class _EntryWrapper(gym.Wrapper, ABC):
@@ -288,3 +291,16 @@ def _count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
         count += isinstance(env, kind)
         env = env.env
     return count
+
+
+def _check_kept(keep: Sequence[str]) -> Sequence[str]:
+    if isinstance(keep, str) or {PARTIAL, PRIVILEGED} & set(keep):
+        raise ValueError(f"keep must be a list of keys, other than {PARTIAL!r} and {PRIVILEGED!r}, got {keep!r}.")
+    return keep
+
+
+def _in_single_precision(box: spaces.Box) -> spaces.Box:
+    """The same box; of floats, float32."""
+    if not np.issubdtype(box.dtype, np.floating):
+        return box
+    return spaces.Box(box.low.astype(np.float32), box.high.astype(np.float32), dtype=np.float32)

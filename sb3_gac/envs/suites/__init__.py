@@ -31,7 +31,8 @@ class Suite(NamedTuple):
     :param module: has them
     :param sensor_noise: whether they take ``noise_std``, and, if an environment does not say otherwise, their privileged entry
         has the whole state
-    :param extra: of this package, with which their simulator is installed; ``None`` where it always is
+    :param history: whether they take ``history``, a number of observations that ``partial`` then has
+    :param extra: of this package, with which their simulator is installed; ``None`` where it always is, or no index has it
     :param simulator: module that it is then found by, by default of the extra's name
     :param preset: with which ``python -m sb3_gac.train`` trains on them
     :param noise_std: with which it does, 0 where sensors are noisy without
@@ -39,6 +40,7 @@ class Suite(NamedTuple):
 
     module: str
     sensor_noise: bool = False
+    history: bool = False
     extra: str | None = None
     simulator: str | None = None
     preset: str = "small"
@@ -69,12 +71,16 @@ _OWN = ("vec_entry_point", "shapes", "whole_state")
 _SINGLE = "sb3_gac.envs.vector.single:make_single"
 
 SUITES = {
-    "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True),
-    "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True),
+    "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True, history=True),
+    "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True, history=True),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
     "playground": Suite(
         "sb3_gac.envs.suites.playground", sensor_noise=True, extra="envpool", preset="playground", noise_std=0.0
     ),
+    "humanoid_bench": Suite(
+        "sb3_gac.envs.suites.humanoid_bench", sensor_noise=True, history=True, simulator="humanoid_bench", noise_std=0.0
+    ),
+    "robotics": Suite("sb3_gac.envs.suites.robotics", sensor_noise=True, history=True, noise_std=0.0),
 }
 
 
@@ -137,3 +143,15 @@ def task_of(env_id: str) -> str:
     :return: the task, as presets and benchmarks name it
     """
     return env_id.removeprefix("sb3_gac/").rpartition("-v")[0]
+
+
+def shows_whole_state(task: str) -> bool:
+    """
+    :param task: see :func:`task_of`
+    :return: whether its privileged entry has all that ``partial`` shows; of a task that is none of this package's, ``True``
+    """
+    try:
+        env_id = env_id_of(task)
+    except ValueError:
+        return True
+    return SUITES[suite_of(env_id) or ""].shows_whole_state(env_id)
