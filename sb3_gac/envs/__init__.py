@@ -20,6 +20,7 @@ from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDic
 if TYPE_CHECKING:
     from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv
     from sb3_gac.envs.vector.envpool import EnvPoolVecEnv
+    from sb3_gac.envs.vector.groups import GroupsVecEnv
     from sb3_gac.envs.vector.registry import make_vec
 
 take_along()
@@ -31,6 +32,7 @@ _VECTOR = {
     "BatchStep": "sb3_gac.envs.vector.base",
     "BatchVecEnv": "sb3_gac.envs.vector.base",
     "EnvPoolVecEnv": "sb3_gac.envs.vector.envpool",
+    "GroupsVecEnv": "sb3_gac.envs.vector.groups",
     "make_vec": "sb3_gac.envs.vector.registry",
 }
 _FORMER = ("mujoco", "pendulum", "popgym")
@@ -57,6 +59,7 @@ __all__ = [
     "BatchVecEnv",
     "EnvPoolVecEnv",
     "FlattenMultiDiscrete",
+    "GroupsVecEnv",
     "History",
     "PreviousAction",
     "SensorNoise",
