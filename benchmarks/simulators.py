@@ -75,7 +75,7 @@ def simulator_step(env: VecEnv, actions: np.ndarray) -> Callable[[], Any]:
         return (lambda: env.advance(actions)) if pool is None else (lambda: pool.step(in_its_type))
     if not isinstance(env, DummyVecEnv):
         raise ValueError(f"env must be a DummyVecEnv or a BatchVecEnv, got {type(env).__name__}.")
-    innermost = [one.unwrapped for one in env.envs]
+    innermost = [getattr(one.unwrapped, "simulated", one.unwrapped) for one in env.envs]
 
     def step_all() -> None:
         for one, action in zip(innermost, actions, strict=True):

@@ -80,7 +80,7 @@ SUITES = {
     "humanoid_bench": Suite(
         "sb3_gac.envs.suites.humanoid_bench", sensor_noise=True, history=True, simulator="humanoid_bench", noise_std=0.0
     ),
-    "robotics": Suite("sb3_gac.envs.suites.robotics", sensor_noise=True, history=True, noise_std=0.0),
+    "robotics": Suite("sb3_gac.envs.suites.robotics", sensor_noise=True, history=True, preset="robotics", noise_std=0.0),
 }
 
 

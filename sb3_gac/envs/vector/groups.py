@@ -90,7 +90,7 @@ class GroupsVecEnv(BatchVecEnv):
         self._shown = _in_arrays(groups)
         terminated, truncated = (_array(flags).astype(bool) for flags in (terminated, truncated))
         self._has_ended = terminated | truncated
-        final = before if self.final_key is None else self._given_final(before)
+        final = self._last_of(before) if self._has_ended.any() else self._shown
         last = {
             name: np.where(self._has_ended.reshape(-1, *[1] * (values.ndim - 1)), final[name], values)
             for name, values in self._shown.items()
@@ -108,13 +108,16 @@ class GroupsVecEnv(BatchVecEnv):
         self._shown, self._has_ended = _in_arrays(groups), np.zeros(self.num_envs, dtype=bool)
         return self._shown
 
-    def _given_final(self, otherwise: Groups) -> Groups:
-        if self._has_ended.any() and self.final_key not in self.extras:
+    def _last_of(self, before: Groups) -> Groups:
+        """Last observations of episodes that have ended."""
+        if self.final_key is None:
+            return before
+        if self.final_key not in self.extras:
             raise ValueError(
-                f'final_key="{self.final_key}", but episodes ended and the extras have {sorted(self.extras)}: leave it out, and '
-                "the observation before the last one stands in."
+                f'final_key="{self.final_key}", but episodes ended and the extras have {sorted(self.extras)}: leave it out, '
+                "and the observation before the last one stands in."
             )
-        return _in_arrays(self.extras[self.final_key]) if self.final_key in self.extras else otherwise
+        return _in_arrays(self.extras[self.final_key])
 
 
 def _bounded(space: spaces.Space, bound: float) -> spaces.Space:
