@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.suite import RunSpec
 from sb3_gac.algorithms import import_path
+from sb3_gac.envs import make_vec
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 
 #: Of the environments of every evaluation
@@ -31,7 +32,10 @@ def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
     takes_noise = suite is None or SUITES[suite].sensor_noise
     if spec.noise and not takes_noise:
         raise ValueError(f"{spec.task} has no sensor noise: give noises: [0].")
-    return ids[spec.task], {"noise_std": spec.noise} if takes_noise else {}
+    if spec.history and not (suite is None or SUITES[suite].history):
+        raise ValueError(f"{spec.task} takes no history: leave it out, and give networks a memory.")
+    history = {} if spec.history is None else {"history": spec.history}
+    return ids[spec.task], {"noise_std": spec.noise, **history} if takes_noise else {}
 
 
 def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:
@@ -43,7 +47,7 @@ def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:
     """
     env_id, kwargs = environment(spec)
     if spec.environment is None:
-        return make_vec_env(env_id, n_envs, seed=seed, env_kwargs=kwargs)
+        return make_vec(env_id, n_envs, seed, **kwargs)
     # What counts returns goes around the wrappers: one of them may change rewards, or end episodes
     return make_vec_env(partial(make_wrapped, env_id, kwargs, spec.environment["wrappers"]), n_envs, seed=seed)
 

@@ -20,7 +20,7 @@ NAMES = ["task", "noise", "algorithm", "seed"]
 NO_NOISE = -1.0
 #: Environment steps of the runs that a run needs
 NEEDED = "needed_steps"
-_PARTICULARS = ["environment", "definition", "needs"]
+_PARTICULARS = ["environment", "definition", "needs", "history"]
 
 
 class FinishedRun(NamedTuple):
@@ -61,7 +61,7 @@ def kind_of(spec: RunSpec) -> str:
     :param spec: of a run
     :return: what runs with the same arguments have in common
     """
-    return f"{spec.algorithm}, {spec.task}" + ("" if spec.noise is None else f", noise {spec.noise:g}")
+    return f"{spec.algorithm}, {spec.title}" + ("" if spec.noise is None else f", noise {spec.noise:g}")
 
 
 def names_of(spec: RunSpec) -> dict[str, Any]:
@@ -69,13 +69,14 @@ def names_of(spec: RunSpec) -> dict[str, Any]:
     :param spec: of a run
     :return: ``NAMES`` -> what a table has there
     """
-    return {name: getattr(spec, name) for name in NAMES} | {"noise": NO_NOISE if spec.noise is None else spec.noise}
+    shown = {"task": spec.title, "noise": NO_NOISE if spec.noise is None else spec.noise}
+    return {name: getattr(spec, name) for name in NAMES} | shown
 
 
 def particulars_of(spec: RunSpec) -> dict[str, Any]:
     """
     :param spec: of a run
-    :return: what not all runs of its suite have: an environment that is no registered task, a definition, needs
+    :return: what not all runs of its suite have: an environment that is no registered task, a definition, needs, a history
     """
     return {name: value for name, value in asdict(spec).items() if name in _PARTICULARS and value is not None}
 

@@ -183,7 +183,7 @@ class Overview:
         for job in shown:
             spec = job.spec
             noise = "" if spec.noise is None else f"{spec.noise:g}"
-            result.add_row(spec.task, noise, spec.algorithm, str(spec.seed), job.state, *progress(job))
+            result.add_row(spec.title, noise, spec.algorithm, str(spec.seed), job.state, *progress(job))
         yield result
         hidden = sum(job.state != "waiting" for job in self._jobs) - len(shown)
         yield Text(count(self._jobs) + (f"; {hidden} of them not shown" if hidden else ""), no_wrap=True, overflow="ellipsis")

@@ -18,7 +18,7 @@ HYPERPARAMS = HERE / "hyperparams"
 _COMMON = ("steps", "envs", "preset", "eval_every", "eval_episodes")
 _SUITE_KEYS = {*_COMMON, "overrides", "algorithms", "cells"}
 _SHARED_KEYS = {"algorithms", "seeds", "needs"}
-_TASK_KEYS = {"task", "noises", *_SHARED_KEYS}
+_TASK_KEYS = {"task", "noises", "history", *_SHARED_KEYS}
 _ENV_KEYS = {"env", "env_kwargs", "wrappers", "name", *_SHARED_KEYS}
 _NAME = re.compile(r"\w[\w.+-]*")
 _WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # other digits may be in quotes for a reason
@@ -41,6 +41,7 @@ class RunSpec:
     :param overrides: arguments of the algorithm that replace those of the preset
     :param environment: ``id``, ``kwargs`` and ``wrappers`` of one that is no registered task
     :param definition: of the algorithm, where the suite has it
+    :param history: observations that ``partial`` holds, with the actions between them; ``None`` for the newest alone
     :param needs: argument of the algorithm -> ``algorithm``, ``steps``, ``definition`` and ``needs`` of the run whose model
         that argument is
     """
@@ -58,11 +59,17 @@ class RunSpec:
     environment: dict[str, Any] | None = None
     definition: dict[str, Any] | None = None
     needs: dict[str, dict[str, Any]] | None = None
+    history: int | None = None
+
+    @property
+    def title(self) -> str:
+        """What figures, tables and files call the task."""
+        return self.task if self.history is None else f"{self.task}-history{self.history}"
 
     @property
     def cell(self) -> str:
         """What a directory is called after, for all algorithms and seeds."""
-        return self.task if self.noise is None else f"{self.task}-noise{self.noise:g}"
+        return self.title if self.noise is None else f"{self.title}-noise{self.noise:g}"
 
     def directory(self, root: Path) -> Path:
         """Where this run's files go."""
@@ -210,7 +217,16 @@ class _Reader:
         particulars = self._particulars(where, cell)
         for noise in noises:
             yield [
-                RunSpec(name, task, noise, seed, **common, environment=environment, **particulars[name])
+                RunSpec(
+                    name,
+                    task,
+                    noise,
+                    seed,
+                    **common,
+                    environment=environment,
+                    history=cell.get("history"),
+                    **particulars[name],
+                )
                 for seed in cell["seeds"]
                 for name in cell["algorithms"]
             ]
@@ -222,7 +238,9 @@ class _Reader:
             environment, name = read_environment(where, cell), cell.get("name", default_name(cell["env"]))
             check_is(f"{where}, name", name, "a name of letters, digits and . + -", str, _NAME.fullmatch)
             return environment, name, [None]
-        check_keys(where, cell, _TASK_KEYS, _TASK_KEYS - {"needs"})
+        check_keys(where, cell, _TASK_KEYS, _TASK_KEYS - {"needs", "history"})
+        if "history" in cell:
+            check_is(f"{where}, history", cell["history"], "a whole number above 1", int, lambda number: number > 1)
         _check_list(f"{where}, noises", cell["noises"], "numbers", (int, float))
         return None, cell["task"], [float(noise) for noise in cell["noises"]]
 

@@ -1,7 +1,8 @@
 """
-Train GAC on a noisy MuJoCo task, then evaluate the learner on its partial observation alone::
+Train GAC on a task with noisy sensors, then evaluate the learner on its partial observation alone::
 
     python -m sb3_gac.train --task HalfCheetah --noise 0.1 --steps 50000 --seed 0
+    python -m sb3_gac.train --history 4    # the learner sees the last four observations, and the actions between them
 
 Everything is saved under ``runs/``: the model, the learning curve as a picture, the evaluations and the resolved
 configuration.  A run that was stopped, by Ctrl-C or otherwise, goes on from its last checkpoint, and ends as it would have
@@ -22,15 +23,14 @@ import matplotlib
 import numpy as np
 import torch as th
 import yaml
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gac import GAC, PRESETS, ExactCheckpointCallback, GuiderLearnerEvalCallback, __version__, preset
 from sb3_gac.checkpoint.files import checkpoints
-from sb3_gac.envs import PARTIAL
-from sb3_gac.envs.suites.mujoco import TASKS
+from sb3_gac.envs import PARTIAL, make_vec
+from sb3_gac.envs.suites import SUITES, Suite, env_id_of, suite_of, task_of
 
 EVAL_SEED = 10_000
 EVALUATIONS = 10
@@ -74,13 +74,19 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     :param arguments: command line, by default the process's
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", default="HalfCheetah", choices=sorted(TASKS))
-    parser.add_argument("--noise", type=float, default=0.1, help="standard deviation of the sensor noise")
+    tasks = sorted(task_of(env_id) for suite in SUITES.values() if suite.sensor_noise for env_id in suite.environments)
+    parser.add_argument("--task", default="HalfCheetah", choices=tasks, metavar="TASK", help=f"one of {', '.join(tasks)}")
+    parser.add_argument(
+        "--noise", type=float, help="standard deviation of the sensor noise, by default 0.1, or 0 where sensors have their own"
+    )
     parser.add_argument("--privileged", default="state", choices=["state", "velocity"])
+    parser.add_argument(
+        "--history", type=int, default=1, help="noisy observations that the learner sees, with the actions between"
+    )
     parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--envs", type=int, help="environments side by side, by default as many as the preset is for")
-    parser.add_argument("--preset", default="small", choices=sorted(PRESETS), help="arguments of GAC")
+    parser.add_argument("--preset", choices=sorted(PRESETS), help="arguments of GAC, by default those for the task's suite")
     parser.add_argument(
         "--compile", action="store_true", help="faster gradient steps after half a minute; needs a C++ compiler"
     )
@@ -93,8 +99,21 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
             return options_of(options.resume)
         except ValueError as error:
             parser.error(str(error))
+    suite = suite_with(options.task)
+    options.noise = suite.noise_std if options.noise is None else options.noise
+    options.preset = options.preset or suite.preset
+    if options.history != 1 and not suite.history:
+        parser.error(f"--history: {options.task} takes none.")
     options.envs = options.envs or PRESETS[options.preset].envs
     return options
+
+
+def suite_with(task: str) -> Suite:
+    """
+    :param task: of an environment
+    :return: the suite that has it
+    """
+    return SUITES[suite_of(env_id_of(task)) or ""]
 
 
 def options_of(directory: Path) -> argparse.Namespace:
@@ -107,9 +126,9 @@ def options_of(directory: Path) -> argparse.Namespace:
         raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
     if not checkpoints(directory / CHECKPOINTS):
         raise ValueError(f"--resume {directory}: there is no checkpoint in {directory / CHECKPOINTS}; start the run again.")
-    names = vars(parse_arguments([]))
+    defaults = vars(parse_arguments([]))
     configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
-    options = {name: configuration[name] for name in names if name != "resume"}
+    options = {name: configuration.get(name, default) for name, default in defaults.items() if name != "resume"}
     return argparse.Namespace(**options | {"runs": Path(options["runs"]), "resume": directory})
 
 
@@ -177,7 +196,8 @@ def start(options: argparse.Namespace) -> Path:
     :param options: see :func:`parse_arguments`
     :return: a new directory for the run, with its configuration
     """
-    name = f"{options.task}-noise{options.noise:g}-seed{options.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    history = "" if options.history == 1 else f"-history{options.history}"
+    name = f"{options.task}-noise{options.noise:g}{history}-seed{options.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     directory = options.runs / name
     directory.mkdir(parents=True)
     configuration = resolved_configuration(options, gac_arguments(options))
@@ -193,10 +213,14 @@ def train(options: argparse.Namespace, directory: Path) -> None:
     :param directory: where everything is saved, see :func:`start`
     """
     set_random_seed(options.seed)
-    env_kwargs = {"noise_std": options.noise, "privileged": options.privileged}
-    env_id = f"sb3_gac/{options.task}-v5"
-    env = make_vec_env(env_id, n_envs=options.envs, seed=options.seed, env_kwargs=env_kwargs)
-    eval_env = make_vec_env(env_id, n_envs=min(5, options.episodes), env_kwargs=env_kwargs)
+    env_kwargs = {"noise_std": options.noise}
+    if options.privileged != "state":  # which not every suite can change
+        env_kwargs["privileged"] = options.privileged
+    if options.history != 1:
+        env_kwargs["history"] = options.history
+    env_id = env_id_of(options.task)
+    env = make_vec(env_id, options.envs, options.seed, **env_kwargs)
+    eval_env = make_vec(env_id, min(5, options.episodes), **env_kwargs)
     model, history, minutes = learn(options, directory, env, eval_env)
     model.save(directory / "model")
     draw_learning_curve(history, f"{options.task}, noise {options.noise:g}", directory / "learning_curve.png")
@@ -260,9 +284,10 @@ def summary(directory: Path) -> str:
     options = yaml.safe_load((directory / "config.yaml").read_text())
     results = json.loads((directory / "results.json").read_text())
     task, noise, episodes = (options[name] for name in ("task", "noise", "episodes"))
+    history = f", history {options['history']}" if options.get("history", 1) > 1 else ""
     learner, random = (f"{results[name]:.0f} +- {results[f'{name}_std']:.0f}" for name in ("learner", "random"))
     return f"""
-Trained GAC on sb3_gac/{task}-v5 (noise {noise:g}) for {results["steps"]} steps in {results["minutes"]:.1f} minutes.
+Trained GAC on {env_id_of(task)} (noise {noise:g}{history}) for {results["steps"]} steps in {results["minutes"]:.1f} minutes.
 Learner, seeing `{PARTIAL}` alone: return {learner} over {episodes} episodes.
 Random actions, same seeds: {random}.
 Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:

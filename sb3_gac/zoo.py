@@ -48,7 +48,9 @@ def hyperparameters(name: str) -> dict[str, dict[str, Any]]:
     for layer in preset.layers(algorithm_class(name), None, 0.0):
         arguments = merge(arguments, layer)
     default = {key: value for key, value in arguments.items() if key != "role_keys"}
-    with_whole_state = [env_id for suite in SUITES.values() if suite.sensor_noise for env_id in suite.environments]
+    with_whole_state = [
+        env_id for suite in SUITES.values() for env_id in suite.environments if suite.shows_whole_state(env_id)
+    ]
     return {"default": default, **dict.fromkeys(with_whole_state, arguments)}
 
 

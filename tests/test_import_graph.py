@@ -23,7 +23,8 @@ ROOMS = {
 }
 FORBIDDEN = {
     **{f"sb3_gac/{room}/**/*.py": rf"sb3_gac(?!\.({allowed})\b)" for room, allowed in ROOMS.items()},
-    "sb3_gac/envs/**/*.py": r"torch\b|stable_baselines3|sb3_gac(?!\.envs\b)",
+    **{f"sb3_gac/envs/{path}.py": r"torch\b|stable_baselines3|sb3_gac(?!\.envs\b)" for path in ("*", "suites/**/*")},
+    "sb3_gac/envs/vector/**/*.py": r"torch\b|sb3_gac(?!\.envs\b)",
     **{
         f"sb3_gac/baselines/{pattern.format(name)}": rf"sb3_gac(?!\.({ROOMS['base']}|version|baselines\.{name})\b)"
         for name in BASELINES
@@ -31,7 +32,7 @@ FORBIDDEN = {
     },
     "sb3_gac/schedules.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "sb3_gac/algorithms.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
-    "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.algorithms\b)",
+    "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.(algorithms|envs\.suites)\b)",
     "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
     "benchmarks/report.py": r"torch\b|sb3_gac\b|benchmarks\b",

@@ -74,6 +74,29 @@ def test_much_noise_has_the_target_kl_of_the_figures():
     assert "target_kl" not in gac_arguments(parse_arguments(["--noise", "0.1"])), "the default"
 
 
+def test_a_history_is_of_the_run_and_a_run_from_before_there_was_one_goes_on(tmp_path, monkeypatch):
+    options = parse_arguments(["--history", "4", "--runs", str(tmp_path), "--task", "Hopper"])
+    directory = start(options)
+    assert "-history4-" in directory.name
+    assert yaml.safe_load((directory / "config.yaml").read_text())["history"] == 4
+    seen = []
+
+    def learn(options, directory, env, eval_env):
+        seen.append([e.observation_space["partial"].shape[0] for e in (env, eval_env)])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sb3_gac.train, "learn", learn)
+    with pytest.raises(KeyboardInterrupt):
+        train(options, directory)
+    assert seen == [[4 * 5 + 3 * 3] * 2]
+    assert "history" not in start(parse_arguments(["--runs", str(tmp_path)])).name
+    (directory / "config.yaml").write_text(
+        "".join(line for line in (directory / "config.yaml").read_text().splitlines(True) if not line.startswith("history"))
+    )
+    monkeypatch.setattr(sb3_gac.train, "checkpoints", lambda path: [path])
+    assert sb3_gac.train.options_of(directory).history == 1
+
+
 @pytest.fixture
 def _quick(monkeypatch):
     """Gradient steps from the 50th step on, of a millisecond each."""

@@ -128,7 +128,9 @@ def test_the_zoos_own_algorithms_train(zoo):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_algorithm_has_hyperparameters_that_it_takes_for_every_registered_task(algorithm):
     settings = hyperparameters(algorithm)
-    assert {"default", "sb3_gac/Pendulum-v1"} == set(settings) - {f"sb3_gac/{task}-v5" for task in envs.suites.mujoco.TASKS}
+    of_mujoco = {f"sb3_gac/{task}-v5" for task in envs.suites.mujoco.TASKS}
+    of_playground = {f"sb3_gac/{task}-v0" for task in envs.suites.playground.TASKS}
+    assert set(settings) == {"default", "sb3_gac/Pendulum-v1", *of_mujoco, *of_playground}
     of_critics = None if algorithm in ("cosil", "rma") else {"critic": ["privileged"]}  # theirs see what the preset can't say
     assert settings[ENV]["role_keys"] == of_critics
     assert "role_keys" not in settings["default"], "elsewhere the privileged entry may not be the whole state"

@@ -31,9 +31,7 @@ def vec_env_state(env: VecEnv) -> dict[str, Any]:
     try:
         if unknown:
             raise NotRestorableError(f"it is not known what the state of {unknown[0]} is")
-        if type(inner) is not DummyVecEnv:
-            raise NotRestorableError(f"the environments of a {type(inner).__name__} are in other processes")
-        episodes, why = [env_state(one) for one in inner.envs], ""
+        episodes, why = _episodes(inner), ""
     except NotRestorableError as error:
         episodes, why = None, str(error)
     return {"names": names, "wrappers": known, "episodes": episodes, "why": why}
@@ -57,13 +55,34 @@ def restore_vec_env_state(env: VecEnv, state: dict[str, Any]) -> str:
     if state["episodes"] is None:
         return state["why"]
     try:
-        if type(inner) is not DummyVecEnv:
-            raise NotRestorableError(f"the environments of a {type(inner).__name__} are in other processes")
-        for one, its_state in zip(inner.envs, state["episodes"], strict=True):
-            restore_env_state(one, its_state)
+        _restore_episodes(inner, state["episodes"])
     except NotRestorableError as error:
         return str(error)
     return ""
+
+
+def _episodes(inner: Any) -> Any:
+    """
+    :raises NotRestorableError: if they can't be taken up again
+    """
+    if hasattr(type(inner), "checkpoint_state"):  # one simulator of them all, see sb3_gac.envs.vector
+        return {"simulator": inner.checkpoint_state()}
+    _check_in_this_process(inner)
+    return [env_state(one) for one in inner.envs]
+
+
+def _restore_episodes(inner: Any, episodes: Any) -> None:
+    if hasattr(type(inner), "restore_checkpoint_state") and isinstance(episodes, dict):
+        inner.restore_checkpoint_state(episodes["simulator"])
+        return
+    _check_in_this_process(inner)
+    for one, its_state in zip(inner.envs, episodes, strict=True):
+        restore_env_state(one, its_state)
+
+
+def _check_in_this_process(inner: Any) -> None:
+    if type(inner) is not DummyVecEnv:
+        raise NotRestorableError(f"the environments of a {type(inner).__name__} are in other processes")
 
 
 def _unwrap(env: VecEnv) -> tuple[list[VecEnvWrapper], Any]:

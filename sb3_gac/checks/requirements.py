@@ -52,8 +52,9 @@ def check_goals(buffer_class: Any, space: spaces.Dict, env: VecEnv | None) -> No
     if not set(GOALS) <= set(entries):
         raise ValueError(
             f"replay_buffer_class={name} replaces goals in the observation's entries {list(GOALS)}, but the observation has "
-            f"{list(entries)}. Leave the goal environment's observation as it is, and say with role_keys who sees what of it: "
-            'role_keys={"learner": ["observation", "desired_goal"]}.'
+            f"{list(entries)}. Leave them as they are (goal_entries=True of registered tasks, keep={list(GOALS)} of "
+            "SplitDictObservation), and say with role_keys who sees what: "
+            'role_keys={"learner": ["partial", "desired_goal"]}.'
         )
     achieved, desired = (entries[goal] for goal in GOALS)
     if stored_shape(achieved) != stored_shape(desired):

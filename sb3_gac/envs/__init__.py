@@ -3,26 +3,45 @@
 import warnings
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sb3_gac.envs.actions import FlattenMultiDiscrete
+from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.subprocesses import take_along
 from sb3_gac.envs.suites import SUITES, register
+from sb3_gac.envs.suites.humanoid_bench import make_humanoid_bench
 from sb3_gac.envs.suites.mujoco import make_mujoco
 from sb3_gac.envs.suites.pendulum import make_pendulum
 from sb3_gac.envs.suites.popgym import make_popgym
+from sb3_gac.envs.suites.robotics import make_robotics
 from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDictObservation, SplitObservation
+
+if TYPE_CHECKING:
+    from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv
+    from sb3_gac.envs.vector.envpool import EnvPoolVecEnv
+    from sb3_gac.envs.vector.groups import GroupsVecEnv
+    from sb3_gac.envs.vector.registry import make_vec
 
 take_along()
 for _suite in SUITES:
     register(_suite)
 
+#: Name -> module that has it and imports SB3, and with it torch, which the other environments do without
+_VECTOR = {
+    "BatchStep": "sb3_gac.envs.vector.base",
+    "BatchVecEnv": "sb3_gac.envs.vector.base",
+    "EnvPoolVecEnv": "sb3_gac.envs.vector.envpool",
+    "GroupsVecEnv": "sb3_gac.envs.vector.groups",
+    "make_vec": "sb3_gac.envs.vector.registry",
+}
 _FORMER = ("mujoco", "pendulum", "popgym")
 
 
 def __getattr__(name: str) -> Any:
-    """Names of earlier versions, for one release."""
+    """Vectorised environments, when they are first used; and names of earlier versions, for one release."""
+    if name in _VECTOR:
+        return getattr(import_module(_VECTOR[name]), name)
     if name in _FORMER:
         return import_module(f"{__name__}.{name}")
     suite = name.removeprefix("register_")
@@ -35,13 +54,21 @@ def __getattr__(name: str) -> Any:
 __all__ = [
     "PARTIAL",
     "PRIVILEGED",
+    "AppendDesiredGoal",
+    "BatchStep",
+    "BatchVecEnv",
+    "EnvPoolVecEnv",
     "FlattenMultiDiscrete",
+    "GroupsVecEnv",
     "History",
     "PreviousAction",
     "SensorNoise",
     "SplitDictObservation",
     "SplitObservation",
+    "make_humanoid_bench",
     "make_mujoco",
     "make_pendulum",
     "make_popgym",
+    "make_robotics",
+    "make_vec",
 ]

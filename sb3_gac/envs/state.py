@@ -41,11 +41,18 @@ CHANGING: dict[str, tuple[str, ...]] = {
     "sb3_gac.envs.wrappers.SensorNoise": ("_generator", "_drawn", "_n_used"),
     "sb3_gac.envs.wrappers.History": ("_values", "_actions"),
     "sb3_gac.envs.wrappers.PreviousAction": (),
+    "sb3_gac.envs.goals.AppendDesiredGoal": (),
+    "sb3_gac.envs.suites.humanoid_bench.WithSensors": (),
+    "sb3_gac.envs.suites.robotics.WithSimulatorState": (),
     "sb3_gac.envs.actions.FlattenMultiDiscrete": (),
 }
 #: Set when a state is restored: the checker looks at an episode's first steps, which were before
 _CHECKED = ("checked_reset", "checked_step", "checked_data_reuse")
 _MUJOCO = "mujoco"  # where the layer's state has this entry, it is of MuJoCo's model and data
+#: Of environments on MuJoCo, beside its state: attributes that a reset draws, and those parts of the model that it may change
+_DRAWN = ("goal",)
+_ADDRESSES = ("plugin_data",)  # in the memory of one process, of what plugins have for one of MuJoCo's data
+_PARTS = ("actuator_", "body_", "dof_", "geom_", "jnt_", "site_")
 
 
 class NotRestorableError(ValueError):
@@ -138,21 +145,34 @@ def _mujoco_state(layer: Any) -> dict[str, Any]:
     spec = mujoco.mjtState.mjSTATE_INTEGRATION
     state = np.empty(mujoco.mj_stateSize(layer.model, spec))
     mujoco.mj_getState(layer.model, layer.data, state, spec)
-    return {"state": state, "derived": {name: array.copy() for name, array in _derived(layer.data).items()}}
+    return {
+        "state": state,
+        "derived": {name: array.copy() for name, array in _arrays(layer.data).items()},
+        "model": {name: array.copy() for name, array in _arrays(layer.model, _PARTS).items() if array.dtype == np.float64},
+        "drawn": {name: deepcopy(getattr(layer, name)) for name in _DRAWN if hasattr(layer, name)},
+    }
 
 
 def _restore_mujoco(layer: Any, saved: dict[str, Any]) -> None:
     import mujoco
 
+    for name, value in saved.get("drawn", {}).items():  # files of earlier versions have none
+        setattr(layer, name, value)
+    _write(_arrays(layer.model, _PARTS), saved.get("model", {}))
     mujoco.mj_setState(layer.model, layer.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION)
     mujoco.mj_forward(layer.model, layer.data)  # as many contacts, and arrays of their sizes, as there were
     mujoco.mj_setState(layer.model, layer.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION)
-    for name, array in _derived(layer.data).items():
-        if name in saved["derived"] and saved["derived"][name].shape == array.shape:
-            array[...] = saved["derived"][name]
+    _write(_arrays(layer.data), saved["derived"])
 
 
-def _derived(data: Any) -> dict[str, np.ndarray]:
-    names = [name for name in dir(data) if not name.startswith("_")]
-    arrays = {name: getattr(data, name) for name in names}
+def _write(arrays: dict[str, np.ndarray], saved: dict[str, np.ndarray]) -> None:
+    for name, array in arrays.items():
+        if name in saved and saved[name].shape == array.shape:
+            array[...] = saved[name]
+
+
+def _arrays(struct: Any, prefixes: tuple[str, ...] = ("",)) -> dict[str, np.ndarray]:
+    """Of MuJoCo's model or data: the arrays whose names begin so."""
+    names = [name for name in dir(struct) if name.startswith(prefixes) and not name.startswith(("_", *_ADDRESSES))]
+    arrays = {name: getattr(struct, name) for name in names}
     return {name: array for name, array in arrays.items() if isinstance(array, np.ndarray) and array.size}

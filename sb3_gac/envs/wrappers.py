@@ -9,19 +9,19 @@ Each is a ``gymnasium.Wrapper``, picklable, and passes gymnasium's and SB3's env
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
+from sb3_gac.envs.selections import KeySelection, as_slice, check_indices, check_keys
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, take_from_box
 
-KeySelection = Sequence[str] | Mapping[str, Sequence[int] | None]
 Observation = dict[str, np.ndarray]
 _NOISE_BLOCK = 128  # drawn at once: one by one takes several times as long
-_NOISE_STREAM = 0x6E6F697365  # keeps the noise apart from generators that others seed with the same number
 
 
 def reset_with(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
@@ -60,11 +60,11 @@ class SplitObservation(_SplitWrapper):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ValueError(f"SplitObservation needs a one-dimensional Box observation, but the environment has {space}.")
         indices = {
-            PARTIAL: _check_indices(PARTIAL, partial, space),
-            PRIVILEGED: _check_indices(PRIVILEGED, privileged, space),
+            PARTIAL: check_indices(PARTIAL, partial, space),
+            PRIVILEGED: check_indices(PRIVILEGED, privileged, space),
         }
         self.observation_space = spaces.Dict({key: take_from_box(space, index) for key, index in indices.items()})
-        self._selectors = [_as_slice(index) for index in indices.values()]
+        self._selectors = [as_slice(index) for index in indices.values()]
 
     def observation(self, observation: np.ndarray) -> Observation:
         """
@@ -84,34 +84,37 @@ class SplitDictObservation(_SplitWrapper):
     :param partial: keys of what the deployed policy will see; as a mapping, key -> indices into the flattened entry,
         or ``None`` for all of it
     :param privileged: likewise for what only training sees
+    :param keep: keys of entries that stay beside the two, with their shapes, such as the goals that ``HerReplayBuffer`` needs
     :raises ValueError: if the observation is of another kind, or a key or an index is unknown
     """
 
-    def __init__(self, env: gym.Env, partial: KeySelection, privileged: KeySelection):
+    def __init__(self, env: gym.Env, partial: KeySelection, privileged: KeySelection, keep: Sequence[str] = ()):
         super().__init__(env)
         space = env.observation_space
         if not isinstance(space, spaces.Dict):
             raise ValueError(f"SplitDictObservation needs a Dict observation, but the environment has {space}.")
         self._selections = {
-            PARTIAL: _check_keys(PARTIAL, partial, space),
-            PRIVILEGED: _check_keys(PRIVILEGED, privileged, space),
+            PARTIAL: check_keys(PARTIAL, partial, space),
+            PRIVILEGED: check_keys(PRIVILEGED, privileged, space),
         }
-        self.observation_space = spaces.Dict(
-            {
-                name: concatenate_boxes([take_from_box(box_entry(space, key), index) for key, index in keys.items()])
-                for name, keys in self._selections.items()
-            }
-        )
+        split = {
+            name: concatenate_boxes([take_from_box(box_entry(space, key), index) for key, index in keys.items()])
+            for name, keys in self._selections.items()
+        }
+        kept = {key: _in_single_precision(box_entry(space, key)) for key in _check_kept(keep)}
+        self._kept = {key: box.dtype for key, box in kept.items()}
+        self.observation_space = spaces.Dict({**split, **kept})
 
     def observation(self, observation: Observation) -> Observation:
         """
         :param observation: of the wrapped environment
-        :return: ``partial`` and ``privileged``, one-dimensional, float32
+        :return: ``partial`` and ``privileged``, one-dimensional, float32; and the entries that stay, of floats float32
         """
-        return {
+        split = {
             name: np.concatenate([np.ravel(observation[key])[index] for key, index in keys.items()], dtype=np.float32)
             for name, keys in self._selections.items()
         }
+        return {**split, **{key: observation[key].astype(dtype) for key, dtype in self._kept.items()}}
 
 
 class _EntryWrapper(gym.Wrapper, ABC):
@@ -168,20 +171,11 @@ class SensorNoise(_EntryWrapper):
 
     def __init__(self, env: gym.Env, noise_std: float | Sequence[float], key: str = PARTIAL):
         super().__init__(env, key)
-        self.noise_std = np.asarray(noise_std, dtype=np.float32)
-        if not (np.isfinite(self.noise_std).all() and (self.noise_std >= 0).all()):
-            raise ValueError(f"noise_std must be a finite number >= 0, or one per component, got {noise_std!r}.")
-        if not np.issubdtype(self._entry.dtype, np.floating):
-            raise ValueError(f'SensorNoise needs a floating-point entry, but "{key}" has {self._entry}.')
-        if self.noise_std.shape not in ((), self._entry.shape):
-            raise ValueError(f"noise_std must be a number or have the entry's shape {self._entry.shape}, got {noise_std!r}.")
-        noisy = np.broadcast_to(self.noise_std, self._entry.shape) > 0
-        low, high = np.where(noisy, -np.inf, self._entry.low), np.where(noisy, np.inf, self._entry.high)
-        dtype = self._entry.dtype
-        self._set_entry_space(spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype))
-        self._stream = [_NOISE_STREAM] * (1 + _count_wrappers(env, SensorNoise))  # apart from noise further in
+        self.noise_std = check_noise_std(noise_std, self._entry, key)
+        self._set_entry_space(noisy_box(self._entry, self.noise_std))
+        self._stream = [NOISE_STREAM] * (1 + _count_wrappers(env, SensorNoise))  # apart from noise further in
         self._generator = np.random.default_rng()
-        self._drawn = np.empty((0, *self._entry.shape), dtype=dtype)
+        self._drawn = np.empty((0, *self._entry.shape), dtype=self._entry.dtype)
         self._n_used = 0
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
@@ -299,28 +293,14 @@ def _count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
     return count
 
 
-def _as_slice(index: np.ndarray) -> np.ndarray | slice:
-    """The same selection, faster where it is a range."""
-    first, last = int(index[0]), int(index[-1])
-    return slice(first, last + 1) if np.array_equal(index, np.arange(first, last + 1)) else index
+def _check_kept(keep: Sequence[str]) -> Sequence[str]:
+    if isinstance(keep, str) or {PARTIAL, PRIVILEGED} & set(keep):
+        raise ValueError(f"keep must be a list of keys, other than {PARTIAL!r} and {PRIVILEGED!r}, got {keep!r}.")
+    return keep
 
 
-def _check_indices(name: str, indices: Sequence[int], space: spaces.Box) -> np.ndarray:
-    array = np.asarray(list(indices))
-    size = int(np.prod(space.shape))
-    is_list = array.ndim == 1 and array.size > 0 and np.issubdtype(array.dtype, np.integer)
-    if not is_list or array.min() < 0 or array.max() >= size:
-        raise ValueError(f"{name} must be a non-empty list of indices in 0..{size - 1}, got {list(indices)}.")
-    return array
-
-
-def _check_keys(name: str, selection: KeySelection, space: spaces.Dict) -> dict[str, Any]:
-    """Key -> index array, or a slice for the whole entry."""
-    if isinstance(selection, str) or not selection:
-        raise ValueError(f"{name} must be a non-empty list of keys, or a mapping from keys to indices, got {selection!r}.")
-    by_key: Mapping[str, Sequence[int] | None] = selection if isinstance(selection, Mapping) else dict.fromkeys(selection)
-    resolved: dict[str, Any] = {}
-    for key, indices in by_key.items():
-        entry = box_entry(space, key)
-        resolved[key] = slice(None) if indices is None else _check_indices(f'{name}["{key}"]', indices, entry)
-    return resolved
+def _in_single_precision(box: spaces.Box) -> spaces.Box:
+    """The same box; of floats, float32."""
+    if not np.issubdtype(box.dtype, np.floating):
+        return box
+    return spaces.Box(box.low.astype(np.float32), box.high.astype(np.float32), dtype=np.float32)

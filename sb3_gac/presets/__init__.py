@@ -24,6 +24,7 @@ import yaml
 from torch import nn, optim
 
 from sb3_gac.algorithms import ALGORITHMS, FAMILIES, algorithm_class, name_of
+from sb3_gac.envs.suites import shows_whole_state
 
 DIRECTORY = Path(__file__).parent
 _ALIASES = {"paper": "paper-brax"}
@@ -56,13 +57,17 @@ class Preset:
         :param algorithm: class that the arguments are for
         :param task: as in ``sb3_gac/<task>-v5``, if it is one that has a name
         :param noise: of that task
-        :return: arguments, the later over the earlier: in each part of the file those of all, of ancestors, and its own
+        :return: arguments, the later over the earlier: in each part of the file those of all, of ancestors, and its own.
+            ``role_keys`` that leave critics the privileged entry alone are not for tasks where that is not the whole state
         """
         families = ["all", *map(name_of, reversed(algorithm.__mro__))]
         of_task = self.tasks.get(task or "", {})
         noises = {float(level): sections for level, sections in of_task.get("noises", {}).items()}
-        for sections in (self.arguments, of_task.get("arguments", {}), noises.get(noise, {})):
-            yield from (sections[family] for family in families if family in sections)
+        parts = (self.arguments, of_task.get("arguments", {}), noises.get(noise, {}))
+        found = [sections[family] for sections in parts for family in families if family in sections]
+        yield from found
+        if any("role_keys" in layer for layer in found) and task is not None and not shows_whole_state(task):
+            yield {"role_keys": None}
 
 
 def read_preset(name: str) -> Preset:

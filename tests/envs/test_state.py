@@ -3,6 +3,7 @@
 from copy import deepcopy
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from stable_baselines3.common.monitor import Monitor
@@ -26,6 +27,11 @@ def _pendulum():
 MAKERS = {task: lambda task=task: gym.make(f"sb3_gac/{task}-v5", noise_std=0.1) for task in TASKS} | {
     "history": _cheetah_with_history,
     "pendulum": _pendulum,
+    "touching hand": lambda: gym.make("sb3_gac/HandManipulateBlockRotateZTouch-v1", noise_std=0.1),
+    "arm with goals": lambda: gym.make("sb3_gac/FetchPush-v4", goal_entries=True),
+    "arm with a history": lambda: gym.make("sb3_gac/FetchReach-v4", noise_std=0.1, history=3),
+    "hand at a door": lambda: gym.make("sb3_gac/AdroitHandDoor-v1", noise_std=0.1, max_episode_steps=40),
+    "hand with a ball": lambda: gym.make("sb3_gac/AdroitHandRelocate-v1", max_episode_steps=40),
     "own methods": lambda: gym.wrappers.TimeLimit(TwoViewBandit(noise_std=0.3, length=9), 7),
 }
 
@@ -71,6 +77,37 @@ def test_a_state_from_before_the_first_reset():
     env, other = _pendulum(), _pendulum()
     restore_env_state(other, env_state(env))
     np.testing.assert_equal(other.reset(seed=0)[0], env.reset(seed=0)[0])
+
+
+PLUGIN = """
+<mujoco><extension><plugin plugin="mujoco.sensor.touch_grid"/></extension>
+<worldbody><geom type="plane" size="1 1 .1"/>
+<body pos="0 0 .2"><freejoint/><geom size=".1"/><site name="s"/></body></worldbody>
+<sensor><plugin name="skin" plugin="mujoco.sensor.touch_grid" objtype="site" objname="s">
+<config key="size" value="2 2"/><config key="fov" value="90 90"/>
+<config key="gamma" value="0"/><config key="nchannel" value="1"/>
+</plugin></sensor></mujoco>
+"""
+
+
+class _Feeling(gym.Env):
+    """On a model with a plugin, whose data are somewhere in this process's memory."""
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(PLUGIN)
+        self.data = mujoco.MjData(self.model)
+
+
+def test_what_a_plugin_has_in_memory_stays_with_its_own_environment():
+    """It would be freed twice."""
+    env, other = _Feeling(), _Feeling()
+    mujoco.mj_step(env.model, env.data, 50)
+    address = other.data.plugin_data.copy()
+    assert address.size == 1
+    assert address != env.data.plugin_data
+    restore_env_state(other, env_state(env))
+    assert other.data.plugin_data == address
+    np.testing.assert_array_equal(other.data.qpos, env.data.qpos)
 
 
 class _Unknown(gym.Wrapper):

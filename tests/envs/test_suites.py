@@ -3,6 +3,7 @@
 import sys
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 from sb3_gac.envs.suites import SUITES, register, suite_of, task_of
@@ -16,7 +17,10 @@ def test_a_suites_environments_are_registered_as_the_table_says(name):
         specification = gym.spec(env_id)
         assert suite_of(env_id) == name
         assert env_id.startswith(f"sb3_gac/{task_of(env_id)}-v")
-        assert {key: getattr(specification, key) for key in arguments} == arguments
+        if "vec_entry_point" in arguments:
+            arguments = {"entry_point": "sb3_gac.envs.vector.single:make_single", "kwargs": {"env_id": env_id}}
+        of_gymnasium = {key: value for key, value in arguments.items() if key not in ("shapes", "whole_state")}
+        assert {key: getattr(specification, key) for key in of_gymnasium} == of_gymnasium
 
 
 def test_every_registered_environment_is_in_a_suite():
@@ -26,15 +30,51 @@ def test_every_registered_environment_is_in_a_suite():
 
 
 @pytest.mark.parametrize("name", [name for name, suite in SUITES.items() if suite.sensor_noise])
-def test_suites_that_say_so_take_sensor_noise_and_show_the_whole_state(name):
-    env_id = next(iter(SUITES[name].environments))
+def test_suites_that_say_so_take_sensor_noise_and_show_the_whole_state_or_what_partial_lacks(name):
     partial, state = (
-        [gym.make(env_id, noise_std=noise).reset(seed=0)[0][entry] for noise in (0.0, 1.0)]
+        [_first_of(name, noise_std=noise).reset(seed=0)[0][entry] for noise in (0.0, 1.0)]
         for entry in ("partial", "privileged")
     )
-    assert (partial[0] != partial[1]).all()
+    assert (partial[0] != partial[1]).mean() > 0.5, "all but goals"
     assert (state[0] == state[1]).all()
-    assert set(partial[0]) < set(state[0])
+    assert (set(partial[0]) < set(state[0])) == SUITES[name].shows_whole_state(next(iter(SUITES[name].environments)))
+
+
+@pytest.mark.parametrize("name", [name for name, suite in SUITES.items() if suite.history])
+def test_suites_that_say_so_take_a_history(name):
+    env, alone = _first_of(name, noise_std=0.1, history=3), _first_of(name, noise_std=0.1)
+    (observation, _), (reference, _) = env.reset(seed=0), alone.reset(seed=0)
+    shown = [reference["partial"]] * 3
+    for number in range(3):
+        action = np.full(env.action_space.shape, 0.1 * number, dtype=np.float32)
+        observation, reference = env.step(action)[0], alone.step(action)[0]
+        shown = [*shown[1:], reference["partial"]]
+    n_actions = 2 * env.action_space.shape[0]
+    assert observation["partial"].size == 3 * shown[0].size + n_actions - 2 * _goal_size(env)
+    assert (observation["privileged"] == reference["privileged"]).all()
+    frames = np.concatenate([frame[: frame.size - _goal_size(env)] for frame in shown])
+    assert (observation["partial"][: frames.size] == frames).all()
+    actions = observation["partial"][frames.size : frames.size + n_actions].reshape(2, -1)
+    assert (actions == np.float32([[0.1], [0.2]])).all()
+
+
+def _first_of(name, **kwargs):
+    """Skips the test where the suite's simulator is not installed."""
+    try:
+        return gym.make(next(iter(SUITES[name].environments)), **kwargs)
+    except ImportError as error:
+        pytest.skip(str(error))
+
+
+def _goal_size(env):
+    return np.size(getattr(env.unwrapped, "goal", ()))
+
+
+@pytest.mark.parametrize("name", [name for name, suite in SUITES.items() if suite.history])
+@pytest.mark.parametrize("history", [0, -1, 1.5, True, "4"])
+def test_a_history_that_is_none_is_named(name, history):
+    with pytest.raises(ValueError, match="history must be an integer of at least 1, got"):
+        _first_of(name, history=history)
 
 
 def test_a_simulator_that_is_missing_is_named_with_its_extra(monkeypatch):

@@ -2,11 +2,23 @@
 The registered environments, suite by suite: one table.
 
 A suite is a module with ``ENVIRONMENTS``, from ids to what ``gymnasium.register`` takes.  It imports its simulator when an
-environment is made, and says with :func:`~sb3_gac.envs.suites.extras.import_extra` how to install it.
+environment is made, and says with :func:`~sb3_gac.envs.suites.extras.import_extra` how to install it.  Beside gymnasium's own
+arguments there may be
+
+``vec_entry_point``
+    in the place of ``entry_point``, where the simulator steps many environments at once: ``module:function``, which takes
+    ``n_envs`` and the ``kwargs``, and returns SB3's ``VecEnv``.  ``gymnasium.make`` makes one environment of it.
+``shapes``
+    of the entries and of the actions, ``{"partial": (48,), "privileged": (123,), "action": (12,)}``, so that they are known
+    without the simulator.
+``whole_state``
+    whether the privileged entry has all that ``partial`` shows, so that critics need nothing else; by default, what the suite
+    says.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -17,13 +29,22 @@ class Suite(NamedTuple):
     Environments that belong together.
 
     :param module: has them
-    :param sensor_noise: whether they take ``noise_std``, and their privileged entry is the whole state
-    :param extra: of this package, with which their simulator is installed; ``None`` where it always is
+    :param sensor_noise: whether they take ``noise_std``, and, if an environment does not say otherwise, their privileged entry
+        has the whole state
+    :param history: whether they take ``history``, a number of observations that ``partial`` then has
+    :param extra: of this package, with which their simulator is installed; ``None`` where it always is, or no index has it
+    :param simulator: module that it is then found by, by default of the extra's name
+    :param preset: with which ``python -m sb3_gac.train`` trains on them
+    :param noise_std: with which it does, 0 where sensors are noisy without
     """
 
     module: str
     sensor_noise: bool = False
+    history: bool = False
     extra: str | None = None
+    simulator: str | None = None
+    preset: str = "small"
+    noise_std: float = 0.1
 
     @property
     def environments(self) -> Mapping[str, Mapping[str, Any]]:
@@ -31,11 +52,35 @@ class Suite(NamedTuple):
         found: Mapping[str, Mapping[str, Any]] = import_module(self.module).ENVIRONMENTS
         return found
 
+    @property
+    def is_installed(self) -> bool:
+        """Whether its simulator is there; it is not imported."""
+        module = self.simulator or self.extra
+        return module is None or find_spec(module) is not None
+
+    def shows_whole_state(self, env_id: str) -> bool:
+        """
+        :param env_id: of one of its environments
+        :return: whether the privileged entry has all that ``partial`` shows
+        """
+        return bool(self.environments[env_id].get("whole_state", self.sensor_noise))
+
+
+#: Arguments of an environment that are this package's, not gymnasium's
+_OWN = ("vec_entry_point", "shapes", "whole_state")
+_SINGLE = "sb3_gac.envs.vector.single:make_single"
 
 SUITES = {
-    "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True),
-    "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True),
+    "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True, history=True),
+    "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True, history=True),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
+    "playground": Suite(
+        "sb3_gac.envs.suites.playground", sensor_noise=True, extra="envpool", preset="playground", noise_std=0.0
+    ),
+    "humanoid_bench": Suite(
+        "sb3_gac.envs.suites.humanoid_bench", sensor_noise=True, history=True, simulator="humanoid_bench", noise_std=0.0
+    ),
+    "robotics": Suite("sb3_gac.envs.suites.robotics", sensor_noise=True, history=True, preset="robotics", noise_std=0.0),
 }
 
 
@@ -44,7 +89,10 @@ def register(suite: str) -> None:
     :param suite: a key of ``SUITES``, whose environments gymnasium is to know
     """
     for env_id, arguments in SUITES[suite].environments.items():
-        gym.register(env_id, **arguments)
+        of_gymnasium = {name: value for name, value in arguments.items() if name not in _OWN}
+        if "vec_entry_point" in arguments:
+            of_gymnasium |= {"entry_point": _SINGLE, "kwargs": {"env_id": env_id}}
+        gym.register(env_id, **of_gymnasium)
 
 
 def suite_of(env_id: str) -> str | None:
@@ -55,9 +103,55 @@ def suite_of(env_id: str) -> str | None:
     return next((name for name, suite in SUITES.items() if env_id in suite.environments), None)
 
 
+def env_id_of(task: str) -> str:
+    """
+    :param task: see :func:`task_of`
+    :return: the environment that it is the task of
+    :raises ValueError: if there is none
+    """
+    ids = {task_of(env_id): env_id for suite in SUITES.values() for env_id in suite.environments}
+    if task not in ids:
+        raise ValueError(f"task must be one of {sorted(ids)}, got {task!r}.")
+    return ids[task]
+
+
+def is_batched(env_id: str) -> bool:
+    """
+    :param env_id: of an environment
+    :return: whether it is of a suite whose simulator steps many environments at once
+    """
+    suite = suite_of(env_id)
+    return suite is not None and "vec_entry_point" in SUITES[suite].environments[env_id]
+
+
+def batch_factory(env_id: str) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """
+    :param env_id: of an environment that :func:`is_batched`
+    :return: what makes vectorised environments, given ``n_envs``, and the task's keyword arguments of it
+    :raises ValueError: if its simulator steps one environment at a time
+    """
+    if not is_batched(env_id):
+        raise ValueError(f"env_id must be of a suite whose simulator steps a batch, got {env_id!r}.")
+    arguments = SUITES[suite_of(env_id) or ""].environments[env_id]
+    module, _, function = arguments["vec_entry_point"].partition(":")
+    return getattr(import_module(module), function), dict(arguments.get("kwargs", {}))
+
+
 def task_of(env_id: str) -> str:
     """
     :param env_id: ``sb3_gac/<task>-v<version>``
     :return: the task, as presets and benchmarks name it
     """
     return env_id.removeprefix("sb3_gac/").rpartition("-v")[0]
+
+
+def shows_whole_state(task: str) -> bool:
+    """
+    :param task: see :func:`task_of`
+    :return: whether its privileged entry has all that ``partial`` shows; of a task that is none of this package's, ``True``
+    """
+    try:
+        env_id = env_id_of(task)
+    except ValueError:
+        return True
+    return SUITES[suite_of(env_id) or ""].shows_whole_state(env_id)

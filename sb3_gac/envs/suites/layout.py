@@ -5,7 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_gac.envs.wrappers import SensorNoise, SplitObservation
+from sb3_gac.envs.wrappers import History, SensorNoise, SplitObservation
 
 PRIVILEGED_CHOICES = ("state", "velocity")
 
@@ -27,18 +27,35 @@ class TaskLayout:
     kwargs: dict[str, Any] = field(default_factory=dict)
 
 
-def make_task(layout: TaskLayout, noise_std: float, privileged: str, **kwargs: Any) -> gym.Env:
+def make_task(layout: TaskLayout, noise_std: float, privileged: str, history: int = 1, **kwargs: Any) -> gym.Env:
     """
     Build a task without its time limit.
 
     :param layout: of the task
     :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
+    :param history: observations that ``partial`` holds, see :func:`noisy_with_history`
     :param kwargs: of the gymnasium environment
-    :raises ValueError: if ``privileged`` is unknown, or ``noise_std`` negative
+    :raises ValueError: if ``privileged`` is unknown, ``noise_std`` negative, or ``history`` not positive
     """
     if privileged not in PRIVILEGED_CHOICES:
         raise ValueError(f"privileged must be one of {list(PRIVILEGED_CHOICES)}, got {privileged!r}.")
     env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs}).unwrapped
     visible = layout.velocity if privileged == "velocity" else tuple(sorted((*layout.partial, *layout.velocity)))
-    return SensorNoise(SplitObservation(env, layout.partial, visible), noise_std)
+    return noisy_with_history(SplitObservation(env, layout.partial, visible), noise_std, history)
+
+
+def noisy_with_history(env: gym.Env, noise_std: float, history: int = 1) -> gym.Env:
+    """
+    What every suite's ``partial`` may have: sensor noise, and a short memory of what was seen through it.
+
+    :param env: with an entry ``partial``
+    :param noise_std: standard deviation of the noise on ``partial``, in its own units; 0 for none
+    :param history: noisy observations that ``partial`` then holds, the newest last, followed by the actions between them;
+        1 for the newest alone
+    :raises ValueError: if ``noise_std`` is negative, or ``history`` no positive integer
+    """
+    if not isinstance(history, int) or isinstance(history, bool) or history < 1:
+        raise ValueError(f"history must be an integer of at least 1, got {history!r}.")
+    noisy = SensorNoise(env, noise_std)
+    return noisy if history == 1 else History(noisy, history, actions=True)

@@ -55,13 +55,14 @@ TASKS: dict[str, TaskLayout] = {
 }
 
 
-def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", **kwargs: Any) -> gym.Env:
+def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", history: int = 1, **kwargs: Any) -> gym.Env:
     """
     Build a task without its time limit, which ``gymnasium.make("sb3_gac/<task>-v5")`` adds.
 
     :param task: a key of ``TASKS``
     :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
+    :param history: noisy observations that ``partial`` holds, the newest last, followed by the actions between them
     :param kwargs: of the gymnasium environment, but for those that change its observation
     :raises ValueError: if the task or ``privileged`` is unknown, ``noise_std`` negative, or ``kwargs`` change the layout
     """
@@ -71,7 +72,7 @@ def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", **
     if misplacing:
         raise ValueError(f"{misplacing} would change the observation, of which the split is made by position.")
     with _without_deprecation():
-        return make_task(TASKS[task], noise_std, privileged, **kwargs)
+        return make_task(TASKS[task], noise_std, privileged, history, **kwargs)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from sb3_gac.envs.suites.layout import TaskLayout, make_task
 LAYOUT = TaskLayout("Pendulum-v1", partial=(0, 1), velocity=(2,))
 
 
-def make_pendulum(noise_std: float = 0.0, privileged: str = "state", **kwargs: Any) -> gym.Env:
+def make_pendulum(noise_std: float = 0.0, privileged: str = "state", history: int = 1, **kwargs: Any) -> gym.Env:
     """
     Build the task without its time limit, which ``gymnasium.make("sb3_gac/Pendulum-v1")`` adds.
 
@@ -17,10 +17,11 @@ def make_pendulum(noise_std: float = 0.0, privileged: str = "state", **kwargs: A
 
     :param noise_std: standard deviation of the noise on ``partial``; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for the angular velocity alone
+    :param history: observations that ``partial`` holds, the newest last, followed by the actions between them
     :param kwargs: of the gymnasium environment
     :raises ValueError: if ``privileged`` is unknown, or ``noise_std`` negative
     """
-    return make_task(LAYOUT, noise_std, privileged, **kwargs)
+    return make_task(LAYOUT, noise_std, privileged, history, **kwargs)
 
 
 #: Id -> how gymnasium makes it, with its time limit of 200 steps

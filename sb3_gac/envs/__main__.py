@@ -1,0 +1,39 @@
+"""
+Print the registered environments: shapes, suites, and how to install what is missing; with ``--speed`` steps per second too::
+
+    python -m sb3_gac.envs
+    python -m sb3_gac.envs Go1 --speed --envs 1 16 128
+"""
+
+import argparse
+
+from sb3_gac.envs.table import Row, in_columns, rows, steps_per_second
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """
+    Command line.
+
+    :param arguments: by default the process's
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_gac.envs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("matching", nargs="?", default="", help="only ids that contain this")
+    parser.add_argument("--speed", action="store_true", help="measure those that are installed")
+    parser.add_argument("--envs", type=int, nargs="+", default=[1, 16], metavar="N", help="side by side, with --speed")
+    parser.add_argument("--seconds", type=float, default=1.0, help="of each measurement")
+    options = parser.parse_args(arguments)
+    found = list(rows(options.matching))
+    numbers = options.envs if options.speed else []
+    header = ["id", *Row._fields[1:], *(f"steps/s, {number}" for number in numbers)]
+    lines = [[*row, *(_speed(row, number, options.seconds) for number in numbers)] for row in found]
+    print(in_columns(header, lines))
+
+
+def _speed(row: Row, n_envs: int, seconds: float) -> str:
+    return f"{steps_per_second(row.env_id, n_envs, seconds):,.0f}" if row.installed == "yes" else "-"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""All registered environments in one table: what they show, what they are installed with, how fast they are."""
+
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
+from sb3_gac.envs.suites import SUITES, Suite
+
+UNKNOWN = "?"
+
+
+class Row(NamedTuple):
+    """
+    An environment.
+
+    :param env_id: its id
+    :param suite: that has it
+    :param partial: shape of that entry, such as "48" or "3x64x64"
+    :param privileged: likewise
+    :param actions: number of components, or of choices
+    :param installed: "yes", or how to
+    """
+
+    env_id: str
+    suite: str
+    partial: str
+    privileged: str
+    actions: str
+    installed: str
+
+
+def rows(matching: str = "") -> Iterator[Row]:
+    """
+    :param matching: what ids must contain
+    :return: environments, suite by suite; those whose shapes no table has are made, if their simulator is there
+    """
+    for name, suite in SUITES.items():
+        for env_id, arguments in suite.environments.items():
+            if matching in env_id:
+                installed = "yes" if suite.is_installed else _how_to_install(suite)
+                yield Row(env_id, name, *_shapes(env_id, suite, arguments.get("shapes")), installed)
+
+
+def _how_to_install(suite: Suite) -> str:
+    return "by hand, docs/environments.md" if suite.extra is None else f'pip install "sb3_gac[{suite.extra}]"'
+
+
+def _shapes(env_id: str, suite: Suite, known: Any) -> tuple[str, str, str]:
+    if known is not None:
+        partial, privileged, action = (_in_words(known[name]) for name in (PARTIAL, PRIVILEGED, "action"))
+        return partial, privileged, action
+    if not suite.is_installed:
+        return UNKNOWN, UNKNOWN, UNKNOWN
+    env = gym.make(env_id)
+    space, actions = env.observation_space, env.action_space
+    env.close()
+    assert isinstance(space, spaces.Dict)
+    return _in_words(space[PARTIAL].shape), _in_words(space[PRIVILEGED].shape), _actions_in_words(actions)
+
+
+def _in_words(shape: Sequence[int] | None) -> str:
+    return UNKNOWN if shape is None else "x".join(map(str, shape))
+
+
+def _actions_in_words(space: spaces.Space) -> str:
+    return f"{space.n} choices" if isinstance(space, spaces.Discrete) else _in_words(space.shape)
+
+
+def steps_per_second(env_id: str, n_envs: int, seconds: float = 1.0) -> float:
+    """
+    :param env_id: of an environment
+    :param n_envs: side by side
+    :param seconds: to measure for, after a tenth of that to warm up
+    :return: steps of all environments together, with random actions, in a second
+    """
+    from sb3_gac.envs.vector.registry import make_vec  # imports SB3, and with it torch
+
+    env = make_vec(env_id, n_envs, seed=0)
+    try:
+        env.reset()
+        actions = np.stack([env.action_space.sample() for _ in range(n_envs)])
+        for duration in (seconds / 10, seconds):
+            n_steps, started = 0, time.perf_counter()
+            while time.perf_counter() < started + duration:
+                env.step(actions)
+                n_steps += n_envs
+        return n_steps / (time.perf_counter() - started)
+    finally:
+        env.close()
+
+
+def in_columns(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """
+    :param header: names of the columns
+    :param lines: with as many cells
+    :return: text, as Markdown has tables
+    """
+    widths = [max(map(len, column)) for column in zip(header, *lines, strict=True)]
+    rule = ["-" * width for width in widths]
+    return "\n".join(
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |"
+        for line in (header, rule, *lines)
+    )

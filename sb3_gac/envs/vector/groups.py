@@ -1,0 +1,138 @@
+"""A simulator of many environments with observations by group, one of them for the critic, as Isaac Lab's are."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_gac.envs.selections import KeySelection
+from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv
+
+Groups = dict[str, np.ndarray]
+
+
+class GroupsVecEnv(BatchVecEnv):
+    """
+    A simulator of N environments, whose observation is ``{"policy": ..., "critic": ...}``, as SB3's ``VecEnv``::
+
+        env = GroupsVecEnv(gym.make("Isaac-Velocity-Rough-Anymal-D-v0", cfg=cfg))
+        model = GAC("MultiInputPolicy", env, role_keys={"critic": ["privileged"]})
+
+    It is asked for ``num_envs``, ``single_observation_space`` (a Dict of Boxes), ``single_action_space``, ``reset(seed=...)``,
+    which returns (groups, extras), and ``step(actions)``, which returns (groups, rewards, terminated, truncated, extras), with
+    tensors of any device, or arrays, of shape (N, ...).
+
+    Such a simulator resets by itself the environments whose episodes have ended, and shows the first observation of the next
+    ones.  Where it does not say what the last one was (``final_key``), the observation before it stands in.  Nothing is lost
+    where episodes terminate, since nothing is expected after that.  At a time limit, the value of what follows is then that of
+    one step earlier.  Episodes can't be taken up again from a checkpoint.
+
+    :param simulator: with the above, wrapped or not
+    :param partial: groups that the deployed policy sees, or a mapping from groups to indices into them
+    :param privileged: likewise what only training sees
+    :param max_action: bound of Box actions where the simulator's have none
+    :param final_key: of ``extras``, under which there are the groups of the last observations, of shape (N, ...); rows count
+        where an episode has ended
+    :param noise_std: standard deviation of noise on ``partial``, a number or one per component; 0 for none
+    :raises ValueError: naming the argument or the group that is wrong
+    """
+
+    def __init__(
+        self,
+        simulator: Any,
+        partial: KeySelection = ("policy",),
+        privileged: KeySelection = ("critic",),
+        max_action: float = 1.0,
+        final_key: str | None = None,
+        noise_std: float | Sequence[float] = 0.0,
+    ):
+        if not 0 < max_action < np.inf:
+            raise ValueError(f"max_action must be a finite number above 0, got {max_action!r}.")
+        self.simulator, self.final_key = simulator, final_key
+        of_one = simulator.unwrapped
+        super().__init__(
+            of_one.num_envs,
+            of_one.single_observation_space,
+            _bounded(of_one.single_action_space, max_action),
+            partial,
+            privileged,
+            noise_std=noise_std,
+        )
+        self.extras: Mapping[str, Any] = {}
+        self._like: Any = None
+        self._shown: Groups = {}
+        self._has_ended = np.zeros(self.num_envs, dtype=bool)
+
+    def start(self, seeds: Sequence[int]) -> Groups:
+        """
+        :param seeds: the simulator has one, the first
+        :return: first observations
+        """
+        return self._reset(seed=seeds[0])
+
+    def restart(self, indices: np.ndarray) -> Groups:
+        """
+        :param indices: of all environments, or of those whose episodes have ended, which the simulator has reset
+        :return: their first observations
+        """
+        if not self._has_ended[indices].all():
+            return self._reset()
+        return {name: values[indices] for name, values in self._shown.items()}
+
+    def advance(self, actions: np.ndarray) -> BatchStep:
+        """
+        :param actions: one for each environment, within the action space
+        """
+        before = self._shown
+        given = actions if self._like is None else self._like.new_tensor(actions)
+        groups, rewards, terminated, truncated, self.extras = self.simulator.step(given)
+        self._shown = _in_arrays(groups)
+        terminated, truncated = (_array(flags).astype(bool) for flags in (terminated, truncated))
+        self._has_ended = terminated | truncated
+        final = self._last_of(before) if self._has_ended.any() else self._shown
+        last = {
+            name: np.where(self._has_ended.reshape(-1, *[1] * (values.ndim - 1)), final[name], values)
+            for name, values in self._shown.items()
+        }
+        return BatchStep(last, _array(rewards), terminated, truncated & ~terminated)
+
+    def close(self) -> None:
+        """Close the simulator."""
+        self.simulator.close()
+
+    def _reset(self, **given: Any) -> Groups:
+        groups, self.extras = self.simulator.reset(**given)
+        first = next(iter(groups.values()))
+        self._like = first if hasattr(first, "new_tensor") else None  # actions go where observations come from
+        self._shown, self._has_ended = _in_arrays(groups), np.zeros(self.num_envs, dtype=bool)
+        return self._shown
+
+    def _last_of(self, before: Groups) -> Groups:
+        """Last observations of episodes that have ended."""
+        if self.final_key is None:
+            return before
+        if self.final_key not in self.extras:
+            raise ValueError(
+                f'final_key="{self.final_key}", but episodes ended and the extras have {sorted(self.extras)}: leave it out, '
+                "and the observation before the last one stands in."
+            )
+        return _in_arrays(self.extras[self.final_key])
+
+
+def _bounded(space: spaces.Space, bound: float) -> spaces.Space:
+    if not isinstance(space, spaces.Box):
+        return space
+    low = np.where(np.isfinite(space.low), space.low, -bound).astype(np.float32)
+    high = np.where(np.isfinite(space.high), space.high, bound).astype(np.float32)
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def _in_arrays(groups: Mapping[str, Any]) -> Groups:
+    """Copies: the simulator may write into its own again."""
+    return {name: np.array(_array(values)) for name, values in groups.items()}
+
+
+def _array(values: Any) -> np.ndarray:
+    """Of a tensor on any device, or of what is like an array."""
+    return np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)

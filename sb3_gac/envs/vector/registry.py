@@ -1,0 +1,26 @@
+"""Vectorised environments by id: a suite's own where its simulator steps a batch, SB3's for all others."""
+
+from typing import Any
+
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_gac.envs.suites import batch_factory, is_batched
+
+
+def make_vec(env_id: str, n_envs: int = 1, seed: int | None = None, **kwargs: Any) -> VecEnv:
+    """
+    :param env_id: of gymnasium; those of suites whose simulator steps a batch become one simulator of ``n_envs`` environments
+    :param n_envs: side by side
+    :param seed: of the first one, the others have the next ones; ``None`` for a random one
+    :param kwargs: of the environment
+    :return: environments whose infos have returns and lengths of episodes
+    :raises ImportError: if the simulator is not installed, saying how to
+    """
+    if not is_batched(env_id):
+        return make_vec_env(env_id, n_envs, seed=seed, env_kwargs=kwargs)
+    factory, of_task = batch_factory(env_id)
+    env: VecEnv = factory(n_envs=n_envs, **of_task | kwargs)
+    env.action_space.seed(seed)
+    env.seed(seed)
+    return env
