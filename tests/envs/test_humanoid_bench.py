@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_gac import preset
 from sb3_gac.envs import make_humanoid_bench
@@ -201,6 +202,13 @@ def test_passes_both_environment_checkers(stand_in, task):
     env = gym.make(f"sb3_gac/{task}-v0", noise_std=0.1)
     gymnasium_check_env(env, skip_render_check=True)
     sb3_check_env(env, skip_render_check=True)
+
+
+def test_nothing_is_opened_to_draw_in_before_there_is_something_to_draw(stand_in):
+    """SB3 asks for a render mode whether or not somebody will render; the stand-in refuses one when it is made."""
+    env = make_vec_env("sb3_gac/h1-walk-v0", 1)
+    assert env.render_mode == "rgb_array"
+    assert pickle.loads(pickle.dumps(make_humanoid_bench("h1-walk", render_mode="human"))).render_mode == "human"
 
 
 def test_trains_with_a_preset(stand_in):

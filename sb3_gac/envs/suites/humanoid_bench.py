@@ -64,15 +64,18 @@ class SeededTask(gym.Wrapper):
 
     :param robot: a key of ``humanoid_bench.env.ROBOTS``
     :param task: a key of ``humanoid_bench.env.TASKS``
+    :param render_mode: of ``render``; HumanoidBench is not told of it when it is made, or it would open a window's context,
+        which needs OpenGL, though nothing is to be drawn
     :param kwargs: of ``HumanoidEnv``
     :raises ImportError: if HumanoidBench, or what it imports, is not there
     """
 
-    def __init__(self, robot: str, task: str, **kwargs: Any):
+    def __init__(self, robot: str, task: str, render_mode: str | None = None, **kwargs: Any):
         bench = _import_bench(f"sb3_gac/{robot}-{task}-v0")
-        defaults = {"control": "pos", "render_mode": None, **bench.TASKS[task]().kwargs}
-        super().__init__(bench.HumanoidEnv(robot=robot, task=task, **{**defaults, **kwargs}))
-        self._arguments = robot, task, kwargs
+        arguments = {"control": "pos", **bench.TASKS[task]().kwargs, **kwargs}
+        super().__init__(bench.HumanoidEnv(robot=robot, task=task, render_mode=None, **arguments))
+        self.unwrapped.render_mode = render_mode
+        self._arguments = robot, task, {"render_mode": render_mode, **kwargs}
         self._generator = np.random.default_rng()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
