@@ -69,6 +69,17 @@ def test_a_preset_brings_its_number_of_environments():
     assert parse_arguments(["--preset", "paper", "--envs", "2"]).envs == 2
 
 
+def test_robots_have_sensors_and_a_preset_of_their_own():
+    options = parse_arguments(["--task", "Go1JoystickFlatTerrain"])
+    assert (options.noise, options.preset, options.envs) == (0.0, "playground", 16)
+    arguments = gac_arguments(options)
+    assert arguments["role_keys"] == {"critic": ["privileged"]}
+    assert arguments["gamma"] == 0.97
+    assert gac_arguments(parse_arguments(["--task", "LeapCubeReorient"]))["gamma"] == 0.99
+    given = parse_arguments(["--task", "Go1Getup", "--noise", "0.2", "--preset", "small", "--envs", "2"])
+    assert (given.noise, given.preset, given.envs) == (0.2, "small", 2)
+
+
 def test_much_noise_has_the_target_kl_of_the_figures():
     assert gac_arguments(parse_arguments(["--noise", "0.3"]))["target_kl"] == 0.001
     assert "target_kl" not in gac_arguments(parse_arguments(["--noise", "0.1"])), "the default"
@@ -170,7 +181,7 @@ def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, monkeypatch, c
         raise KeyboardInterrupt
 
     with monkeypatch.context() as context:
-        context.setattr(sb3_gac.train, "make_vec_env", stopped)
+        context.setattr(sb3_gac.train, "make_vec", stopped)
         with pytest.raises(SystemExit):
             main([*QUICK, "--runs", str(tmp_path)])
     assert "Stopped before there was anything to keep" in capsys.readouterr().err
@@ -196,7 +207,7 @@ def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_pat
     seeds = []
     env = SimpleNamespace(seeds=seeds, seed=seeds.append, action_space=space, num_envs=1)
     monkeypatch.setattr(sb3_gac.train, "evaluate_policy", evaluated)
-    monkeypatch.setattr(sb3_gac.train, "make_vec_env", lambda *args, **kwargs: env)
+    monkeypatch.setattr(sb3_gac.train, "make_vec", lambda *args, **kwargs: env)
     monkeypatch.setattr(sb3_gac.train, "learn", lambda *args: (model, [], 1.5))
     monkeypatch.setattr(sb3_gac.train, "draw_learning_curve", lambda *args: None)
     (tmp_path / "checkpoints").mkdir()

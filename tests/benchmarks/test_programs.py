@@ -475,6 +475,8 @@ def test_tasks_without_sensor_noise_have_none():
     spec = RunSpec("gac", "popgym-BattleshipEasy", 0.0, 0, 1, 1, "small-memory", 1, 1)
     assert environment(spec) == ("sb3_gac/popgym-BattleshipEasy-v0", {})
     assert environment(replace(spec, task="Ant", noise=0.2)) == ("sb3_gac/Ant-v5", {"noise_std": 0.2})
+    robot = replace(spec, task="Go1Getup", noise=0.0, preset="playground")
+    assert environment(robot) == ("sb3_gac/Go1Getup-v0", {"noise_std": 0.0})
     with pytest.raises(ValueError, match="has no sensor noise"):
         environment(replace(spec, noise=0.1))
     with pytest.raises(ValueError, match="task must be one of the registered"):

@@ -8,8 +8,11 @@ import pytest
 import torch as th
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_gac import GAC
+from benchmarks.environments import make_envs
+from benchmarks.suite import RunSpec
+from sb3_gac import GAC, AsymmetricSAC, preset
 from sb3_gac.envs import EnvPoolVecEnv, make_vec
 from sb3_gac.envs.suites.playground import TASKS, make_playground
 from tests.envs import fake_envpool
@@ -159,6 +162,14 @@ def test_a_checkpoint_says_that_episodes_start_anew(stand_in, tmp_path):
         GAC.resume(tmp_path, made()).learn(10)
 
 
+def test_benchmarks_have_a_pool_for_all_their_environments(stand_in):
+    spec = RunSpec("gac", "Go1JoystickFlatTerrain", 0.0, 0, 100, 4, "playground", 50, 3)
+    env = make_envs(spec, 4, seed=0)
+    assert type(env) is EnvPoolVecEnv
+    env.reset()
+    assert len(stand_in) == 1
+
+
 def test_tasks_are_made_by_id_alone_and_side_by_side(stand_in):
     env = make_vec("sb3_gac/Go1JoystickFlatTerrain-v0", n_envs=2, seed=3, noise_std=0.5)
     assert (type(env), env.task_id) == (EnvPoolVecEnv, "MuJoCoPlayground/Go1JoystickFlatTerrain-v1")
@@ -244,6 +255,17 @@ def test_a_fall_is_none_of_the_limit_and_the_limit_is_none_of_a_fall(real):
     cut = _run(GO1, time_limit=5, steps=10)
     assert [dones.tolist() for _, _, dones, _ in cut[1:]] == [[step % 5 == 0] * 2 for step in range(1, 11)]
     assert all(info["TimeLimit.truncated"] for step in (5, 10) for info in cut[step][3])
+
+
+@pytest.mark.parametrize("algorithm", [GAC, AsymmetricSAC])
+def test_robots_are_learned_on_with_the_preset(real, algorithm):
+    env = VecNormalize(make_vec(f"sb3_gac/{GO1}-v0", n_envs=2, seed=0), norm_reward=False)
+    model = algorithm("MultiInputPolicy", env, seed=0, **preset("playground", task=GO1, algorithm=algorithm, buffer_size=500))
+    model.learning_starts = 100
+    model.learn(160)
+    assert model._n_updates == 4 * 30
+    assert {info["l"] for info in model.ep_info_buffer} <= set(range(2, 81))
+    assert all(set(model.policy.role_keys[role]) == {"privileged"} for role in model.policy.role_keys if "critic" in role)
 
 
 def test_checkers_pass(real):
