@@ -24,7 +24,7 @@ ROOMS = {
 FORBIDDEN = {
     **{f"sb3_gac/{room}/**/*.py": rf"sb3_gac(?!\.({allowed})\b)" for room, allowed in ROOMS.items()},
     **{f"sb3_gac/envs/{path}.py": r"torch\b|stable_baselines3|sb3_gac(?!\.envs\b)" for path in ("*", "suites/**/*")},
-    "sb3_gac/envs/vector/**/*.py": r"torch\b|sb3_gac(?!\.envs\b)",
+    "sb3_gac/envs/vector/**/*.py": r"sb3_gac(?!\.envs\b)",
     **{
         f"sb3_gac/baselines/{pattern.format(name)}": rf"sb3_gac(?!\.({ROOMS['base']}|version|baselines\.{name})\b)"
         for name in BASELINES
