@@ -71,6 +71,7 @@ _OWN = ("vec_entry_point", "shapes", "whole_state")
 _SINGLE = "sb3_gac.envs.vector.single:make_single"
 
 SUITES = {
+    "brax": Suite("sb3_gac.envs.suites.brax", sensor_noise=True, extra="brax"),
     "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True, history=True),
     "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True, history=True),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),

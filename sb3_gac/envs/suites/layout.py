@@ -15,7 +15,7 @@ class TaskLayout:
     """
     Where a task's observation holds what.
 
-    :param env_id: gymnasium's id
+    :param env_id: the simulator's own id
     :param partial: indices of positions and other quantities without velocities
     :param velocity: indices of velocities
     :param kwargs: of ``gymnasium.make``
@@ -25,6 +25,29 @@ class TaskLayout:
     partial: tuple[int, ...]
     velocity: tuple[int, ...]
     kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+def positions_first(env_id: str, n_positions: int, n_velocities: int, **kwargs: Any) -> TaskLayout:
+    """
+    :param env_id: the simulator's own id
+    :param n_positions: at the observation's beginning
+    :param n_velocities: after them
+    :param kwargs: of ``gymnasium.make``
+    """
+    size = n_positions + n_velocities
+    return TaskLayout(env_id, tuple(range(n_positions)), tuple(range(n_positions, size)), kwargs)
+
+
+def visible_in(layout: TaskLayout, privileged: str) -> tuple[int, ...]:
+    """
+    :param layout: of the task
+    :param privileged: "state" for the whole clean state, "velocity" for velocities alone
+    :return: indices of the privileged entry
+    :raises ValueError: if ``privileged`` is unknown
+    """
+    if privileged not in PRIVILEGED_CHOICES:
+        raise ValueError(f"privileged must be one of {list(PRIVILEGED_CHOICES)}, got {privileged!r}.")
+    return layout.velocity if privileged == "velocity" else tuple(sorted((*layout.partial, *layout.velocity)))
 
 
 def make_task(layout: TaskLayout, noise_std: float, privileged: str, history: int = 1, **kwargs: Any) -> gym.Env:
@@ -38,10 +61,8 @@ def make_task(layout: TaskLayout, noise_std: float, privileged: str, history: in
     :param kwargs: of the gymnasium environment
     :raises ValueError: if ``privileged`` is unknown, ``noise_std`` negative, or ``history`` not positive
     """
-    if privileged not in PRIVILEGED_CHOICES:
-        raise ValueError(f"privileged must be one of {list(PRIVILEGED_CHOICES)}, got {privileged!r}.")
+    visible = visible_in(layout, privileged)
     env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs}).unwrapped
-    visible = layout.velocity if privileged == "velocity" else tuple(sorted((*layout.partial, *layout.velocity)))
     return noisy_with_history(SplitObservation(env, layout.partial, visible), noise_std, history)
 
 

@@ -24,12 +24,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_gac.envs.suites.layout import TaskLayout, make_task
-
-
-def _positions_first(env_id: str, n_positions: int, n_velocities: int, **kwargs: Any) -> TaskLayout:
-    size = n_positions + n_velocities
-    return TaskLayout(env_id, tuple(range(n_positions)), tuple(range(n_positions, size)), kwargs)
+from sb3_gac.envs.suites.layout import TaskLayout, make_task, positions_first
 
 
 def _humanoid(env_id: str) -> TaskLayout:
@@ -44,14 +39,14 @@ _DEPRECATED = "compiler attribute 'settotalmass' is deprecated"
 
 
 TASKS: dict[str, TaskLayout] = {
-    "HalfCheetah": _positions_first("HalfCheetah-v5", 8, 9),
-    "Ant": _positions_first("Ant-v5", 13, 14, include_cfrc_ext_in_observation=False),
+    "HalfCheetah": positions_first("HalfCheetah-v5", 8, 9),
+    "Ant": positions_first("Ant-v5", 13, 14, include_cfrc_ext_in_observation=False),
     "Humanoid": _humanoid("Humanoid-v5"),
     "HumanoidStandup": _humanoid("HumanoidStandup-v5"),
-    "InvertedDoublePendulum": _positions_first("InvertedDoublePendulum-v5", 5, 3),
-    "Hopper": _positions_first("Hopper-v5", 5, 6),
-    "Walker2d": _positions_first("Walker2d-v5", 8, 9),
-    "Swimmer": _positions_first("Swimmer-v5", 3, 5),
+    "InvertedDoublePendulum": positions_first("InvertedDoublePendulum-v5", 5, 3),
+    "Hopper": positions_first("Hopper-v5", 5, 6),
+    "Walker2d": positions_first("Walker2d-v5", 8, 9),
+    "Swimmer": positions_first("Swimmer-v5", 3, 5),
 }
 
 
