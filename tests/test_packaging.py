@@ -24,6 +24,8 @@ PARTS = {  # extra -> what of it is needed, and what needs it
     "export, learner": (["onnxruntime"], "import sb3_gac.learner"),
     "popgym": (["popgym"], "import gymnasium; gymnasium.make('sb3_gac:sb3_gac/popgym-AutoencodeEasy-v0')"),
     "envpool": (["envpool"], "import gymnasium; gymnasium.make('sb3_gac:sb3_gac/Go1Getup-v0')"),
+    "brax": (["jax", "brax"], "import gymnasium; gymnasium.make('sb3_gac:sb3_gac/brax-Ant-v0')"),
+    "playground": (["jax"], "import gymnasium; gymnasium.make('sb3_gac:sb3_gac/Go1Getup-v0', backend='mjx')"),
     "benchmarks": (["pandas", "plotly"], "import benchmarks.launch"),
     "benchmarks, report": (["plotly"], "import benchmarks.report"),
     "benchmarks, aggregate": (["rliable"], "import benchmarks.aggregate"),

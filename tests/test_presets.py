@@ -10,6 +10,7 @@ import sb3_gac.presets
 from sb3_gac import GAC, PRESETS, AsymmetricSAC, GACShare, preset
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.envs.suites import SUITES, task_of
 from sb3_gac.presets import instantiate, read_preset
 from tests.helpers import TwoViewBandit
 
@@ -62,6 +63,15 @@ def test_every_preset_says_for_how_many_environments_it_is_and_is_taken_by_every
 def test_the_papers_preset_has_the_name_of_its_file_and_a_short_one():
     assert preset("paper", task="Ant", noise=0.3) == preset("paper-brax", task="Ant", noise=0.3)
     assert PRESETS["paper"].envs == 128
+
+
+def test_the_papers_tasks_in_brax_are_the_papers_tasks():
+    for task in SUITES["brax"].environments:
+        name = task_of(task).removeprefix("brax-")
+        assert preset("paper", task=task_of(task), noise=0.1) == preset("paper", task=name, noise=0.1)
+        assert name in PRESETS["paper"].tasks
+    assert preset("paper", task="brax-Ant", noise=0.3)["target_kl"] == 0.001
+    assert preset("paper", task="other-Ant", noise=0.3)["target_kl"] == preset("paper")["target_kl"] == 0.005
 
 
 def test_target_kl_is_that_of_task_and_noise_or_ones_own():

@@ -59,7 +59,7 @@ def test_every_extra_that_a_user_may_need_is_named_where_installing_is_explained
     (text,) = re.findall(r"## Install\n(.*?)\n## ", README, re.DOTALL)
     assert "pip install -e ." in text
     (named,) = re.findall(r"what an extra needs \((.*)\)", text)
-    assert set(named.split(", ")) == set(parser["options.extras_require"]) - {"dev", "brax"}
+    assert set(named.split(", ")) == set(parser["options.extras_require"]) - {"dev"}
 
 
 def test_there_is_python_in_the_readme():

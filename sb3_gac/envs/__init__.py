@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv
     from sb3_gac.envs.vector.envpool import EnvPoolVecEnv
     from sb3_gac.envs.vector.groups import GroupsVecEnv
+    from sb3_gac.envs.vector.jax_env import JaxVecEnv
     from sb3_gac.envs.vector.registry import make_vec
 
 take_along()
@@ -33,6 +34,7 @@ _VECTOR = {
     "BatchVecEnv": "sb3_gac.envs.vector.base",
     "EnvPoolVecEnv": "sb3_gac.envs.vector.envpool",
     "GroupsVecEnv": "sb3_gac.envs.vector.groups",
+    "JaxVecEnv": "sb3_gac.envs.vector.jax_env",
     "make_vec": "sb3_gac.envs.vector.registry",
 }
 _FORMER = ("mujoco", "pendulum", "popgym")
@@ -61,6 +63,7 @@ __all__ = [
     "FlattenMultiDiscrete",
     "GroupsVecEnv",
     "History",
+    "JaxVecEnv",
     "PreviousAction",
     "SensorNoise",
     "SplitDictObservation",

@@ -28,6 +28,7 @@ from sb3_gac.envs.suites import shows_whole_state
 
 DIRECTORY = Path(__file__).parent
 _ALIASES = {"paper": "paper-brax"}
+_BRAX = "brax-"  # the paper's tasks in its own simulator: what is meant for the paper's task is meant for them
 _LIBRARIES = {"activation_fn": nn, "optimizer_class": optim}
 
 
@@ -55,13 +56,13 @@ class Preset:
     def layers(self, algorithm: type, task: str | None, noise: float) -> Iterator[Mapping[str, Any]]:
         """
         :param algorithm: class that the arguments are for
-        :param task: as in ``sb3_gac/<task>-v5``, if it is one that has a name
+        :param task: as in ``sb3_gac/<task>-v5``, if it is one that has a name; Brax's ``brax-<task>`` are those of the paper
         :param noise: of that task
         :return: arguments, the later over the earlier: in each part of the file those of all, of ancestors, and its own.
             ``role_keys`` that leave critics the privileged entry alone are not for tasks where that is not the whole state
         """
         families = ["all", *map(name_of, reversed(algorithm.__mro__))]
-        of_task = self.tasks.get(task or "", {})
+        of_task = self.tasks.get(task or "", self.tasks.get((task or "").removeprefix(_BRAX), {}))
         noises = {float(level): sections for level, sections in of_task.get("noises", {}).items()}
         parts = (self.arguments, of_task.get("arguments", {}), noises.get(noise, {}))
         found = [sections[family] for sections in parts for family in families if family in sections]
@@ -133,7 +134,7 @@ def preset(
     """
     :param name: one of ``PRESETS``, such as "small" or "paper"
     :param algorithm: that the arguments are for: its class, or its name in :mod:`sb3_gac.algorithms`
-    :param task: as in ``sb3_gac/<task>-v5``: with what the preset has for it, if it has something
+    :param task: as in ``sb3_gac/<task>-v5`` or ``sb3_gac/brax-<task>-v0``: with what the preset has for it, if anything
     :param noise: of that task
     :param overrides: arguments that replace those of the preset; ``policy_kwargs`` are merged
     :return: keyword arguments of the algorithm, with its ``policy`` where the preset names one; ``PRESETS[name].envs``

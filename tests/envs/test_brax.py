@@ -38,6 +38,12 @@ def test_there_is_one_id_for_each_of_the_papers_tasks():
     assert set(SUITES["brax"].environments) == {f"sb3_gac/brax-{task}-v0" for task in TABLE_7}
 
 
+def test_the_table_knows_their_shapes():
+    for task, (whole, partial, _, actions) in TABLE_7.items():
+        shapes = SUITES["brax"].environments[f"sb3_gac/brax-{task}-v0"]["shapes"]
+        assert shapes == {"partial": (partial,), "privileged": (whole,), "action": (actions,)}
+
+
 def test_without_brax_it_is_said_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "brax.envs", None)
     monkeypatch.setitem(sys.modules, "brax", None)
@@ -63,7 +69,7 @@ def test_entries_are_positions_and_velocities_of_the_simulators_own_state(brax, 
     observation = env.step(np.stack([moved, -moved, 0 * moved, moved]))[0]
     assert env.observation_space["partial"].shape == (partial,)
     assert env.observation_space["privileged"].shape == (velocity,)
-    assert env.action_space.shape == (actions,)
+    assert env.action_space.shape == (actions,) == (env.env.action_size,)
     state = env._state.pipeline_state
     if task == "InvertedDoublePendulum":
         q = np.asarray(state.q)

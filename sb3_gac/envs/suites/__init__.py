@@ -71,7 +71,6 @@ _OWN = ("vec_entry_point", "shapes", "whole_state")
 _SINGLE = "sb3_gac.envs.vector.single:make_single"
 
 SUITES = {
-    "brax": Suite("sb3_gac.envs.suites.brax", sensor_noise=True, extra="brax"),
     "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True, history=True),
     "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True, history=True),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
@@ -81,6 +80,7 @@ SUITES = {
     "humanoid_bench": Suite(
         "sb3_gac.envs.suites.humanoid_bench", sensor_noise=True, history=True, simulator="humanoid_bench", noise_std=0.0
     ),
+    "brax": Suite("sb3_gac.envs.suites.brax", sensor_noise=True, extra="brax"),
     "robotics": Suite("sb3_gac.envs.suites.robotics", sensor_noise=True, history=True, preset="robotics", noise_std=0.0),
 }
 

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.suites.extras import import_extra
 from sb3_gac.envs.suites.layout import TaskLayout, positions_first, visible_in
 
@@ -46,6 +47,7 @@ TASKS: dict[str, TaskLayout] = {
     "Humanoid": _humanoid("humanoid"),
     "HumanoidStandup": _humanoid("humanoidstandup"),
 }
+_ACTIONS = {"InvertedDoublePendulum": 1, "HalfCheetah": 6, "Ant": 8, "Humanoid": 17, "HumanoidStandup": 17}
 
 
 def make_brax(
@@ -84,7 +86,7 @@ def make_brax(
         n_envs,
         EXTRA,
         observation_space=spaces.Box(-np.inf, np.inf, (size,), np.float32),
-        action_space=spaces.Box(-1.0, 1.0, (env.action_size,), np.float32),
+        action_space=spaces.Box(-1.0, 1.0, (_ACTIONS[task],), np.float32),
         partial=layout.partial,
         privileged=visible,
         time_limit=time_limit,
@@ -92,7 +94,16 @@ def make_brax(
     )
 
 
-#: Id -> how it is made
+#: Id -> how gymnasium makes it; time limits are counted by the vectorised environments
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
-    f"sb3_gac/brax-{task}-v0": {"vec_entry_point": f"{__name__}:make_brax", "kwargs": {"task": task}} for task in TASKS
+    f"sb3_gac/brax-{task}-v0": {
+        "vec_entry_point": f"{__name__}:make_brax",
+        "kwargs": {"task": task},
+        "shapes": {
+            PARTIAL: (len(layout.partial),),
+            PRIVILEGED: (len(visible_in(layout, "state")),),
+            "action": (_ACTIONS[task],),
+        },
+    }
+    for task, layout in TASKS.items()
 }

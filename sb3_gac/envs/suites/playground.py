@@ -3,10 +3,15 @@ MuJoCo Playground: robots and hands whose designers drew the line between what a
 
 ``partial`` is the task's ``state``, with the noise of sensors that the task has itself, and ``privileged`` its
 ``privileged_state``, which begins with ``state`` to the bit: critics on ``privileged`` alone lose nothing.  EnvPool (extra
-``envpool``) simulates them, with C MuJoCo on the CPU.
+``envpool``) simulates them with C MuJoCo on the CPU; with ``backend="mjx"`` Playground itself does (extra ``playground``), on
+accelerators.
 """
 
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
 
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.suites.extras import import_extra
@@ -48,25 +53,73 @@ TASKS = {
 }
 
 
-def make_playground(task: str, n_envs: int = 1, **kwargs: Any) -> Any:
+def make_playground(task: str, n_envs: int = 1, backend: str = "envpool", **kwargs: Any) -> Any:
     """
     Build vectorised environments of a task; ``sb3_gac.envs.make_vec("sb3_gac/<task>-v0")`` does so by id.
 
     :param task: a key of ``TASKS``
     :param n_envs: number of environments
-    :param kwargs: of :class:`sb3_gac.envs.EnvPoolVecEnv`: ``noise_std``, ``time_limit``, ``num_threads`` and the task's own,
-        such as ``noise_level``
-    :raises ValueError: if the task is unknown
-    :raises ImportError: if EnvPool is not installed, saying how to
+    :param backend: "envpool", on the CPU, or "mjx", on JAX's default device, of Playground itself
+    :param kwargs: ``noise_std``, ``time_limit``, and the backend's own: of :class:`sb3_gac.envs.EnvPoolVecEnv`, such as
+        ``num_threads`` and the task's ``noise_level``; or of :func:`make_mjx`
+    :raises ValueError: if the task or the backend is unknown
+    :raises ImportError: if the simulator is not installed, saying how to
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {sorted(BACKENDS)}, got {backend!r}.")
+    return BACKENDS[backend](task, n_envs, **_SPLIT | kwargs)
+
+
+def _make_envpool(task: str, n_envs: int, **kwargs: Any) -> Any:
     import_extra("envpool", "envpool", f"sb3_gac/{task}-v0")  # before SB3 and torch, which take seconds
     from sb3_gac.envs.vector.envpool import EnvPoolVecEnv
 
-    split = {"partial": ["state"], "privileged": ["privileged_state"]}
-    return EnvPoolVecEnv(f"MuJoCoPlayground/{task}-v1", n_envs, **split | kwargs)
+    return EnvPoolVecEnv(f"MuJoCoPlayground/{task}-v1", n_envs, **kwargs)
 
+
+def make_mjx(
+    task: str,
+    n_envs: int = 1,
+    noise_level: float | None = None,
+    impl: str | None = None,
+    config: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Any:
+    """
+    Build vectorised environments of a task of Playground itself, which fetches its robots when it is first used.
+
+    :param task: a key of ``TASKS``
+    :param n_envs: number of environments
+    :param noise_level: of the noise that the task has itself, from 0 for none; by default, the task's own
+    :param impl: of MJX: "jax" or "warp"; by default "jax" on the CPU and the task's own elsewhere
+    :param config: of Playground, dotted name -> value, such as ``{"pert_config.enable": True}``
+    :param options: of :class:`~sb3_gac.envs.vector.base.BatchVecEnv`
+    :raises ImportError: if Playground is not installed, saying how to
+    """
+    environment = f'sb3_gac/{task}-v0 with backend="mjx"'
+    jax, playground = (import_extra(name, "playground", environment) for name in ("jax", "mujoco_playground"))
+    from sb3_gac.envs.vector.jax_env import JaxVecEnv
+
+    settings = playground.registry.get_default_config(task)
+    if "impl" in settings and (impl is not None or jax.default_backend() == "cpu"):
+        settings.impl = impl or "jax"
+    if noise_level is not None:
+        settings.noise_config.level = float(noise_level)
+    env = playground.registry.load(task, config=settings, config_overrides=dict(config or {}))
+    robot = TASKS[task]
+    sizes = {"state": robot.partial, "privileged_state": robot.privileged}
+    defaults = {
+        "observation_space": spaces.Dict({key: spaces.Box(-np.inf, np.inf, (size,)) for key, size in sizes.items()}),
+        "action_space": spaces.Box(-1.0, 1.0, (robot.actions,)),
+        "time_limit": robot.time_limit,
+    }
+    return JaxVecEnv(env, n_envs, "playground", **defaults | _SPLIT | options)
+
+
+_SPLIT = {"partial": ["state"], "privileged": ["privileged_state"]}
+BACKENDS: dict[str, Callable[..., Any]] = {"envpool": _make_envpool, "mjx": make_mjx}
 
 #: Id -> how gymnasium makes it; time limits are counted by the vectorised environments
 ENVIRONMENTS: dict[str, dict[str, Any]] = {

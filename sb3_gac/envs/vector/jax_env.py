@@ -54,6 +54,7 @@ class JaxVecEnv(BatchVecEnv):
         super().__init__(n_envs, **options)
         jax = self._jax = import_extra("jax", extra, type(self).__name__)
         _keep_compiled_programs(jax)
+        self.env = env
         self._of_seeds = np.zeros(self.num_envs, dtype=np.uint32)
         self._episodes = np.zeros(self.num_envs, dtype=np.uint32)
         self._chunk = min(self.num_envs, max(_CHUNK, self.num_envs // _CHUNKS))
