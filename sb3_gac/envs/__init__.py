@@ -6,11 +6,13 @@ from importlib import import_module
 from typing import Any
 
 from sb3_gac.envs.actions import FlattenMultiDiscrete
+from sb3_gac.envs.camera import CameraImage, NoRenderingError
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.subprocesses import take_along
 from sb3_gac.envs.suites import SUITES, register
 from sb3_gac.envs.suites.mujoco import make_mujoco
 from sb3_gac.envs.suites.pendulum import make_pendulum
+from sb3_gac.envs.suites.pixels import make_pixels
 from sb3_gac.envs.suites.popgym import make_popgym
 from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDictObservation, SplitObservation
 
@@ -35,13 +37,16 @@ def __getattr__(name: str) -> Any:
 __all__ = [
     "PARTIAL",
     "PRIVILEGED",
+    "CameraImage",
     "FlattenMultiDiscrete",
     "History",
+    "NoRenderingError",
     "PreviousAction",
     "SensorNoise",
     "SplitDictObservation",
     "SplitObservation",
     "make_mujoco",
     "make_pendulum",
+    "make_pixels",
     "make_popgym",
 ]

@@ -89,8 +89,8 @@ class FrameStack:
         if not np.array_equal(stacks[:, self.width :], next_stacks[:, : -self.width]):
             raise ValueError(
                 f'replay_buffer_kwargs={{"frame_stacks": {{"{self.key}": {self.length}}}}} says that the entry "{self.key}" '
-                "is the last frames of something, joined along its first axis, the oldest first, but after a step its "
-                "older frames are not the newer ones from before: leave the entry out of frame_stacks. The step was not stored."
+                "is the last frames of something, joined along its first axis, the oldest first, but after a step "
+                "its older frames are not the newer ones from before: leave it out of frame_stacks. The step was not stored."
             )
 
     def begin(self, step: int, goes_on: np.ndarray, stacks: np.ndarray) -> None:

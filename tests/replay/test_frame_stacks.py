@@ -232,7 +232,7 @@ def test_what_is_no_stack_is_refused_with_its_step():
     before = {name: array.copy() for name, array in ours.rows_by_name().items()}
     obs, other = (camera._observation(envs) for envs in (camera.envs, [*map(camera._moved_on, camera.envs)]))
     other["sensors"] = other["sensors"][:, ::-1] + 2
-    with pytest.raises(ValueError, match=r'"frame_stacks": \{"sensors": 4\}.*leave the entry out.*The step was not stored'):
+    with pytest.raises(ValueError, match=r'"frame_stacks": \{"sensors": 4\}.*leave it out.*The step was not stored'):
         ours.add(obs, other, np.zeros((2, 2)), np.zeros(2), np.zeros(2, bool), [{}, {}])
     assert ours.n_added == 1
     for name, array in ours.rows_by_name().items():

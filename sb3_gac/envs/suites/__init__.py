@@ -34,6 +34,7 @@ class Suite(NamedTuple):
 
 SUITES = {
     "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True),
+    "pixels": Suite("sb3_gac.envs.suites.pixels"),
     "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
 }
