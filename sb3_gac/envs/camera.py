@@ -38,7 +38,7 @@ class CameraImage(EntryWrapper):
 
     def __init__(self, env: gym.Env, size: int = 64, camera: str = "track", key: str = PARTIAL):
         super().__init__(env, key)
-        model = getattr(env.unwrapped, "model", None)
+        model: Any = getattr(env.unwrapped, "model", None)
         if type(model).__name__ != "MjModel":
             raise ValueError(f"CameraImage needs an environment of gymnasium's MuJoCo, but got {env.unwrapped}.")
         cameras = [model.camera(number).name for number in range(model.ncam)]
