@@ -111,6 +111,16 @@ def test_samples_are_those_of_sb3s_buffer(capacity, n_envs, n_steps, p_end, p_re
             _assert_equal_samples(ours, sb3s, ours.n_added)
 
 
+def test_episodes_of_any_length():
+    """Longer than an age can count."""
+    ours, sb3s = _make(40, 1), DictReplayBuffer(40, SPACE, ACTIONS, "cpu", 1)
+    camera = Camera(1, seed=0, p_end=0.0, padding="noise")
+    for step in range(270):
+        camera.step(ours, sb3s)
+        if step in (127, 128, 129, 256, 269):
+            _assert_equal_samples(ours, sb3s, ours.n_added)
+
+
 @pytest.mark.parametrize("how", ["pickle", "checkpoint"])
 @pytest.mark.parametrize("padding", PADDINGS)
 @pytest.mark.parametrize("n_before", [0, 1, 5, 9, 23])
