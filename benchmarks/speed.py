@@ -37,6 +37,7 @@ from benchmarks.models import (
     recurrent_step_flops,
     step_flops,
 )
+from benchmarks.pixels import tabulate_image_steps, tabulate_pixels
 from benchmarks.profiles import env_step, profile_rollout, profile_step
 from benchmarks.run import provenance
 
@@ -283,6 +284,8 @@ TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name
         {"task": task} | compare_checkpoints(sizes, 256, 10_000 if quick else 1_000_000, 2_000 if quick else 20_000)
         for task, sizes in SIZES.items()
     ],
+    "pixels": tabulate_pixels,
+    "image_steps": tabulate_image_steps,
     "buffers": lambda threads, quick: [{"task": task} | compare_buffers(sizes) for task, sizes in SIZES.items()],
 }
 

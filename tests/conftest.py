@@ -1,7 +1,16 @@
-"""Ctrl-C works in tests: a job that a script's shell runs in the background ignores it, and so would whatever tests start."""
+"""
+Ctrl-C works in tests: a job that a script's shell runs in the background ignores it, and so would whatever tests start.
+
+MuJoCo draws with EGL where that is installed; it looks for that when it is imported.
+"""
 
 import contextlib
+import ctypes.util
+import os
 import signal
+
+if ctypes.util.find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     with contextlib.suppress(ValueError):  # only the main thread may

@@ -65,6 +65,7 @@ class _OffPolicyArguments(PositionalArguments, total=False):
     behaviour: Annotated[BehaviourSpec, None]
     behaviour_per: Annotated[str, "episode"]
     recording: Annotated[str | PathLike | None, None]
+    random_shift: Annotated[int, 0]
 
 
 class OffPolicyArguments(_OffPolicyArguments, CommonArguments, total=False):

@@ -18,13 +18,14 @@ from typing_extensions import Self, Unpack
 
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.base.arguments import OffPolicyArguments, with_defaults
+from sb3_gac.base.augmentation import shifted, shifted_entries
 from sb3_gac.base.batch import Batch, Metrics
 from sb3_gac.base.behaviour import Behaviour, BehaviourSpec
 from sb3_gac.base.collecting import DataCollection
 from sb3_gac.base.overrides import check_known, check_unchanged
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.recording import Recording
-from sb3_gac.base.roles import RoleKeys, resolve_update_every
+from sb3_gac.base.roles import RoleKeys, resolve_role_keys, resolve_update_every
 from sb3_gac.checks.arguments import COMMON_CHECKS, OFF_POLICY_CHECKS, ArgumentCheck, check_train_freq
 from sb3_gac.checks.entries import check_held_by
 from sb3_gac.checks.requirements import check_goals, check_rewards_of_goals
@@ -74,6 +75,8 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
     :param behaviour_per: "episode", or "environment" for shares of the environments
     :param recording: path of what :func:`sb3_gac.write_recording` wrote of another run: its actions are taken, warm-up
         included, in environments that are made alike and return what they did, which is checked; ``None`` for own data
+    :param random_shift: pixels by which gradient steps shift the images that the deployed policy reads, at random and each on
+        its own, up to so many in each direction (DrQ's augmentation, there 4); 0 for none
     :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
         "critic" stands for all critics: where ``privileged`` is the whole state, spare them the sensor noise with
@@ -97,6 +100,7 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
     progress = (*AsymmetricAlgorithm.progress, *DataCollection.collected)
     _waiting = False
     _recorded: Recording | None = None
+    _shifted_entries: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -119,6 +123,7 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         self.behaviour: BehaviourSpec = arguments.pop("behaviour")
         self.behaviour_per: str = arguments.pop("behaviour_per")
         self.recording: str | PathLike | None = arguments.pop("recording")
+        self.random_shift: int = arguments.pop("random_shift")
         self.lr_scales: Mapping[str, float] | None = arguments.pop("lr_scales")
         self.role_keys: RoleKeys | None = arguments.pop("role_keys")
         self.compile: bool = arguments.pop("compile")
@@ -163,6 +168,9 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
         check_goals(self.replay_buffer_class, self.observation_space, self.env)
         resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
+        roles = self.policy_class.roles
+        seen = resolve_role_keys(self.observation_space, roles, self.role_keys)[roles.deployed]
+        self._shifted_entries = shifted_entries(self.observation_space, seen, self.random_shift)
         buffer_class = self.replay_buffer_class or CompactDictReplayBuffer
         if self.recording is not None and not issubclass(buffer_class, CompactDictReplayBuffer):
             raise ValueError("recording needs a CompactDictReplayBuffer: leave replay_buffer_class out.")
@@ -175,8 +183,9 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         """See :meth:`ResumableAlgorithm.check_fixed_arguments`; how the replay buffer stores numbers is one of them."""
         super().check_fixed_arguments(given, before)
         if "replay_buffer_kwargs" in given and "replay_buffer_kwargs" in before:
-            now, then = ((arguments["replay_buffer_kwargs"] or {}).get("storage_dtype") for arguments in (given, before))
-            check_unchanged("replay_buffer_kwargs' storage_dtype", now, then, "resume()")
+            for option in ("storage_dtype", "frame_stacks"):
+                now, then = ((arguments["replay_buffer_kwargs"] or {}).get(option) for arguments in (given, before))
+                check_unchanged(f"replay_buffer_kwargs' {option}", now, then, "resume()")
 
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The entropy temperature, in most algorithms."""
@@ -393,6 +402,7 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
             samples, histories = buffer.sample_with_histories(batch_size, self.history_length, env=self.sampling_env)
         else:
             samples = buffer.sample(batch_size, env=self.sampling_env)
+        samples = shifted(samples, self._shifted_entries, self.random_shift)
         discounts = getattr(samples, "discounts", None)
         if discounts is None:
             discounts = th.full((), self.gamma, device=self.device)

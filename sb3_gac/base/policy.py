@@ -58,7 +58,7 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
     :param features_extractor_kwargs: keyword arguments for it
     :param share_features_extractor: whether the other roles see the deployed policy's features of its entries, as they
         are, and encode only the other entries themselves; the deployed policy's loss trains that encoder (saves most
-        of the work where ``partial`` is an image)
+        of the work where ``partial`` is an image). Roles that read none of its entries have an encoder of their own
     :param normalize_images: divide images by 255
     :param optimizer_class: optimiser of policies and critics
     :param optimizer_kwargs: keyword arguments for it, without the learning rate
@@ -166,6 +166,7 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
 
     def _build_networks(self) -> None:
         shared: BaseFeaturesExtractor | None = None
+        self._check_sharing()
         for role in self.roles.policies:
             policy = self.make_policy(role, **self._role_kwargs(role, shared), log_std_bounds=self._log_std_bounds)
             setattr(self, role, policy)
@@ -212,7 +213,7 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
         :param shared: the deployed policy's encoder, if this role is to use it; without it the role gets one of its own
         """
         features_extractor, rest_extractor = shared, None
-        if shared is None:
+        if shared is None or not self._sees_deployed(role):
             features_extractor = self.make_extractor(role, self.role_keys[role])
         else:
             rest_extractor = self.make_extractor(role, self._keys_beside_the_deployed(role))
@@ -256,6 +257,18 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
         return (
             VectorExtractor(space) if VectorExtractor.fits(space) else EntryExtractor(space, **self.features_extractor_kwargs)
         )
+
+    def _sees_deployed(self, role: str) -> bool:
+        """Whether the role reads any of the deployed policy's entries."""
+        return not set(self.role_keys[role]).isdisjoint(self.role_keys[self.roles.deployed])
+
+    def _check_sharing(self) -> None:
+        others = [role for role in self.roles.others if self.has(role)]
+        if self.share_features_extractor and not any(map(self._sees_deployed, others)):
+            raise ValueError(
+                f"share_features_extractor=True would do nothing, since none of {others} reads the {self.roles.deployed}'s "
+                f"entries {list(self.role_keys[self.roles.deployed])}: leave it out, or name them in role_keys."
+            )
 
     def _keys_beside_the_deployed(self, role: str) -> list[str]:
         shared = self.role_keys[self.roles.deployed]

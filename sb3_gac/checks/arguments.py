@@ -212,4 +212,5 @@ OFF_POLICY_CHECKS: Mapping[str, ArgumentCheck] = {
     "behaviour": partial(check_type, types=(str, Mapping, type(None)), expected="a policy's name, a dict of shares or None"),
     "behaviour_per": partial(check_choice, choices=("episode", "environment")),
     "recording": partial(check_type, types=(str, os.PathLike, type(None)), expected="a path or None"),
+    "random_shift": partial(check_integer, low=0),
 }

@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sb3_gac.envs.actions import FlattenMultiDiscrete
+from sb3_gac.envs.camera import CameraImage, NoRenderingError
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.subprocesses import take_along
@@ -13,6 +14,7 @@ from sb3_gac.envs.suites import SUITES, register
 from sb3_gac.envs.suites.humanoid_bench import make_humanoid_bench
 from sb3_gac.envs.suites.mujoco import make_mujoco
 from sb3_gac.envs.suites.pendulum import make_pendulum
+from sb3_gac.envs.suites.pixels import make_pixels
 from sb3_gac.envs.suites.popgym import make_popgym
 from sb3_gac.envs.suites.robotics import make_robotics
 from sb3_gac.envs.wrappers import History, PreviousAction, SensorNoise, SplitDictObservation, SplitObservation
@@ -59,11 +61,13 @@ __all__ = [
     "AppendDesiredGoal",
     "BatchStep",
     "BatchVecEnv",
+    "CameraImage",
     "EnvPoolVecEnv",
     "FlattenMultiDiscrete",
     "GroupsVecEnv",
     "History",
     "JaxVecEnv",
+    "NoRenderingError",
     "PreviousAction",
     "SensorNoise",
     "SplitDictObservation",
@@ -71,6 +75,7 @@ __all__ = [
     "make_humanoid_bench",
     "make_mujoco",
     "make_pendulum",
+    "make_pixels",
     "make_popgym",
     "make_robotics",
     "make_vec",

@@ -117,7 +117,7 @@ class SplitDictObservation(_SplitWrapper):
         return {**split, **{key: observation[key].astype(dtype) for key, dtype in self._kept.items()}}
 
 
-class _EntryWrapper(gym.Wrapper, ABC):
+class EntryWrapper(gym.Wrapper, ABC):
     """Base of wrappers that change one entry of a Dict observation."""
 
     def __init__(self, env: gym.Env, key: str):
@@ -156,7 +156,7 @@ class _EntryWrapper(gym.Wrapper, ABC):
         """The entry after a step."""
 
 
-class SensorNoise(_EntryWrapper):
+class SensorNoise(EntryWrapper):
     """
     Add independent Gaussian noise N(0, noise_std^2) to one entry, drawn once per reset and per step.
 
@@ -195,7 +195,7 @@ class SensorNoise(_EntryWrapper):
         return value + self._drawn[self._n_used - 1]
 
 
-class History(_EntryWrapper):
+class History(EntryWrapper):
     """
     Replace one entry by its last ``length`` values, oldest first, joined along the first axis.
 
@@ -246,7 +246,7 @@ class History(_EntryWrapper):
         return np.concatenate(parts, dtype=self._entry.dtype)
 
 
-class PreviousAction(_EntryWrapper):
+class PreviousAction(EntryWrapper):
     """
     Append the previous action to one entry, one-hot where it is one of a number; and, on request, the previous reward.
 

@@ -1,10 +1,9 @@
 """A replay buffer for dict observations that stores each observation once."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-import psutil
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
@@ -12,8 +11,10 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gac.checks.entries import computable
+from sb3_gac.replay.frame_stack import resolve_frame_stacks
 from sb3_gac.replay.histories import Histories, steps_before, unbroken
-from sb3_gac.replay.observation_store import FinalObservations, ObservationLayout, Rows
+from sb3_gac.replay.observation_ring import ObservationRing
+from sb3_gac.replay.observation_store import FinalObservations, ObservationLayout, Rows, check_fits_in_memory
 
 DONE, TIME_LIMIT, CUT = 1, 2, 4
 
@@ -24,7 +25,8 @@ class CompactDictReplayBuffer(DictReplayBuffer):
 
     Only where an episode ends, or the environment was reset from outside, is a final observation kept apart.  One row
     more than the capacity holds the newest next observation.  Exact for terminations, time limits and several
-    environments, and drops in for SB3's ``DictReplayBuffer``, which stores every observation twice.
+    environments, and drops in for SB3's ``DictReplayBuffer``, which stores every observation twice. Of stacks of frames, named
+    in ``frame_stacks``, each frame is stored once.
 
     :param buffer_size: transitions kept, over all environments
     :param observation_space: Dict
@@ -36,6 +38,8 @@ class CompactDictReplayBuffer(DictReplayBuffer):
     :param n_steps: rewards summed up in a sample; it ends early where the episode or the data do
     :param gamma: discount factor of that sum
     :param storage_dtype: "float16" to store floating-point entries at half precision
+    :param frame_stacks: entry -> number of its frames, joined along its first axis, the oldest first, as
+        :class:`sb3_gac.envs.History` and SB3's ``VecFrameStack`` join them: ``{"partial": 3}``
     :raises MemoryError: if the buffer can't fit into the memory that is available
     """
 
@@ -54,6 +58,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         n_steps: int = 1,
         gamma: float = 0.99,
         storage_dtype: str | None = None,
+        frame_stacks: Mapping[str, int] | None = None,
     ):
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
         if n_steps < 1:
@@ -63,31 +68,42 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         self.handle_timeout_termination = handle_timeout_termination
         self.n_steps = n_steps
         self.gamma = gamma
-        self.layout = ObservationLayout(observation_space, None if storage_dtype is None else np.dtype(storage_dtype))
-        self.n_rows = self.buffer_size + 1
+        lengths = resolve_frame_stacks(observation_space, frame_stacks)
+        self.layout = ObservationLayout(observation_space, None if storage_dtype is None else np.dtype(storage_dtype), lengths)
+        self.n_rows = self.buffer_size + max(lengths.values(), default=1)  # the oldest one's frames are there, too
         action_dtype = np.dtype(self._maybe_cast_dtype(action_space.dtype))
-        self._check_memory(self.layout.row_bytes() + self.action_dim * action_dtype.itemsize + 5)
-        self._rows = self.layout.empty(self.n_rows, n_envs)
+        row_bytes = self.layout.row_bytes() + self.action_dim * action_dtype.itemsize + 5
+        check_fits_in_memory(self.buffer_size * n_envs, self.n_rows * n_envs, row_bytes)
+        self._ring = ObservationRing(self.layout, self.n_rows, n_envs)
         self._finals = FinalObservations(self.layout)
         self.actions = np.zeros((self.n_rows, n_envs, self.action_dim), dtype=action_dtype)
         self.rewards = np.zeros((self.n_rows, n_envs), dtype=np.float32)
         self.endings = np.zeros((self.n_rows, n_envs), dtype=np.uint8)
         self._n_added = 0
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Buffers of earlier versions have their rows themselves."""
+        rows = state.pop("_rows", None)
+        vars(self).update(state)
+        if rows is not None:
+            self._ring = ObservationRing(self.layout, self.n_rows, self.n_envs)
+            self._ring.rows = rows
+
     # --- what SB3's buffers show -------------------------------------------------------------------------------------
 
     @property
     def observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
         """Entry -> shape (rows, n_envs, \\*entry shape); the row at ``pos`` is the newest next observation."""
-        return self.layout.unpack(self._rows)
+        return self._everywhere(self._gather)
 
     @property
     def next_observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
         """Entry -> shape (rows, n_envs, \\*entry shape), put together for inspection."""
-        rows, envs = np.divmod(np.arange(self.n_rows * self.n_envs), self.n_envs)
-        following = self._next_rows(rows, envs, only_stored=True)
-        shaped = {group: values.reshape(self.n_rows, self.n_envs, -1) for group, values in following.items()}
-        return self.layout.unpack(shaped)
+        return self._everywhere(lambda rows, envs: self._next_rows(rows, envs, only_stored=True))
+
+    def _everywhere(self, gather: Callable[[np.ndarray, np.ndarray], Rows]) -> dict[str, np.ndarray]:
+        packed = gather(*np.divmod(np.arange(self.n_rows * self.n_envs), self.n_envs))
+        return self.layout.unpack({group: values.reshape(*self.endings.shape, -1) for group, values in packed.items()})
 
     @property
     def dones(self) -> np.ndarray:  # type: ignore[override]
@@ -101,8 +117,8 @@ class CompactDictReplayBuffer(DictReplayBuffer):
 
     def nbytes(self) -> int:
         """Bytes allocated."""
-        arrays = [*self._rows.values(), self.actions, self.rewards, self.endings]
-        return sum(array.nbytes for array in arrays) + self._finals.nbytes()
+        arrays = (self.actions, self.rewards, self.endings)
+        return sum(array.nbytes for array in arrays) + self._ring.nbytes() + self._finals.nbytes()
 
     def size(self) -> int:
         """Transitions kept per environment."""
@@ -117,6 +133,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         super().reset()
         self._n_added = self._n_retired = 0
         self._finals = FinalObservations(self.layout)
+        self._ring.reset()
         self.endings[:] = 0
 
     # --- checkpoints -------------------------------------------------------------------------------------------------
@@ -128,12 +145,13 @@ class CompactDictReplayBuffer(DictReplayBuffer):
 
     def rows_by_name(self) -> dict[str, np.ndarray]:
         """What the ring holds, by row: arrays of shape (rows, n_envs, \\*), not copied; a step writes its row and the next."""
-        return {**self._rows, "actions": self.actions, "rewards": self.rewards, "endings": self.endings}
+        return {**self._ring.rows_by_name(), "actions": self.actions, "rewards": self.rewards, "endings": self.endings}
 
     def bookkeeping(self) -> dict[str, Any]:
         """All else that there is, for :meth:`restore_bookkeeping`."""
         counts = {"n_added": self._n_added, "n_retired": self._n_retired}
-        return {**counts, "shape": list(self.rewards.shape), "finals": self._finals.state()}
+        apart = {"finals": self._finals.state(), "frames": self._ring.state()}
+        return {**counts, "shape": list(self.rewards.shape), **apart}
 
     def restore_bookkeeping(self, state: dict[str, Any]) -> None:
         """
@@ -146,6 +164,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         self.pos = self._n_added % self.n_rows
         self.full = self._n_added >= self.buffer_size
         self._finals.restore(state["finals"])
+        self._ring.restore(state.get("frames", {}))
 
     # --- adding ------------------------------------------------------------------------------------------------------
 
@@ -168,25 +187,27 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         :raises ValueError: naming the entry that does not fit, see :meth:`ObservationLayout.pack`; nothing is then stored
         """
         rows, next_rows = self.layout.pack(obs, self.n_envs), self.layout.pack(next_obs, self.n_envs)
+        self._ring.check_follows(rows, next_rows)
         self._finals.forget_from(self._n_added * self.n_envs)
+        goes_on = np.zeros(self.n_envs, dtype=bool)
         if self._n_added:
-            self._cut_what_does_not_continue(rows)
-        for group, values in rows.items():
-            self._rows[group][self.pos] = values
+            goes_on = self._ring.goes_on(self._n_added, rows)
+            self._cut(~goes_on)  # someone did not say so
+        self._ring.write(self._n_added, rows, goes_on)
         self.actions[self.pos] = np.reshape(action, (self.n_envs, self.action_dim))
         self.rewards[self.pos] = reward
         self.endings[self.pos] = np.asarray(done, dtype=np.uint8) * DONE
         if self.handle_timeout_termination:
             by_time_limit = np.array([bool(info.get("TimeLimit.truncated", False)) for info in infos])
             self.endings[self.pos] |= np.where(done, by_time_limit, False).astype(np.uint8) * np.uint8(TIME_LIMIT)
-        self._keep_finals(np.flatnonzero(self.endings[self.pos]), next_rows, self._n_added)
+        self._keep_finals(np.flatnonzero(self.endings[self.pos]), self.layout.stored(next_rows), self._n_added)
 
         self._n_added += 1
         self.pos = self._n_added % self.n_rows
         self.full = self._n_added >= self.buffer_size
-        for group, values in next_rows.items():
-            self._rows[group][self.pos] = values
+        self._ring.write_next(self._n_added, next_rows)
         self._finals.forget_before((self._n_added - self.size()) * self.n_envs)
+        self._ring.forget_before(self._n_added - self.size())
 
     def mark_reset(self) -> None:
         """Whoever resets the environments from outside says so: what was added last is not continued by what comes next."""
@@ -197,10 +218,6 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         """What is stored is not sampled from now on; it stays the history of what is to come."""
         self._n_retired = self._n_added
 
-    def _cut_what_does_not_continue(self, rows: Rows) -> None:
-        """Where an episode goes on from another observation than it reached, someone did not say so."""
-        self._cut(np.any([np.any(rows[group] != values[self.pos], axis=1) for group, values in self._rows.items()], axis=0))
-
     def _cut(self, envs: np.ndarray) -> None:
         """
         :param envs: whether to cut what was added last, unless it ends an episode anyway, shape (n_envs,)
@@ -208,7 +225,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         previous = (self._n_added - 1) % self.n_rows
         cut = np.flatnonzero(envs & (self.endings[previous] == 0))
         self.endings[previous, cut] = CUT
-        self._keep_finals(cut, {group: values[self.pos] for group, values in self._rows.items()}, self._n_added - 1)
+        self._keep_finals(cut, {group: values[self.pos] for group, values in self._ring.rows.items()}, self._n_added - 1)
 
     def _keep_finals(self, envs: np.ndarray, rows: Rows, step: int) -> None:
         if len(envs):
@@ -256,10 +273,12 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         rewards, last, discounts = self._n_step_rewards(batch_inds, envs, env)
         endings = self.endings[last, envs]
         terminated = (endings & (DONE | TIME_LIMIT)) == DONE
+        observations = self._gather(batch_inds, envs)
+        following = self._next_rows(last, envs, before=observations if self.n_steps == 1 else None)
         return DictReplayBufferSamples(
-            observations=self._to_tensors(self._gather(batch_inds, envs), env),
+            observations=self._to_tensors(observations, env),
             actions=self.to_torch(self.actions[batch_inds, envs], copy=False),
-            next_observations=self._to_tensors(self._next_rows(last, envs), env),
+            next_observations=self._to_tensors(following, env),
             dones=self.to_torch(terminated.astype(np.float32)[:, None], copy=False),
             rewards=self.to_torch(rewards[:, None], copy=False),
             discounts=None if discounts is None else self.to_torch(discounts[:, None], copy=False),
@@ -272,15 +291,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         mask = self.to_torch(valid.astype(np.float32), copy=False)
         entries = self._to_tensors(self._gather(rows.ravel(), np.broadcast_to(envs, rows.shape).ravel()), env)
         actions = self.actions[rows, envs] * valid[..., None].astype(self.actions.dtype)
-        observations = {key: entry.unflatten(0, rows.shape) for key, entry in entries.items()}
-        return Histories(
-            {
-                key: entry * mask.view(*rows.shape, *[1] * (entry.dim() - 2)).to(entry.dtype)
-                for key, entry in observations.items()
-            },
-            self.to_torch(actions, copy=False),
-            mask,
-        )
+        return Histories.of(entries, self.to_torch(actions, copy=False), mask)
 
     def _n_step_rewards(
         self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None
@@ -301,28 +312,28 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         return rewards.astype(np.float32), last, powers[count].astype(np.float32)
 
     def _gather(self, rows: np.ndarray, envs: np.ndarray) -> Rows:
-        flat = rows * self.n_envs + envs
-        return {group: values.reshape(-1, values.shape[-1]).take(flat, axis=0) for group, values in self._rows.items()}
+        # Step for which a row was written: the latest one up to _n_added that falls on it
+        return self._ring.gather(self._n_added - (self._n_added - rows) % self.n_rows, envs)
 
-    def _next_rows(self, rows: np.ndarray, envs: np.ndarray, only_stored: bool = False) -> Rows:
-        """Packed next observations: the following row, or what was kept apart."""
-        following = self._gather((rows + 1) % self.n_rows, envs)
+    def _next_rows(self, rows: np.ndarray, envs: np.ndarray, only_stored: bool = False, before: Rows | None = None) -> Rows:
+        """Packed next observations: the following row, or what was kept apart; ``before``: of these rows, if gathered."""
         # Step at which a row was written: the latest one below _n_added that falls on it
         steps = self._n_added - 1 - (self._n_added - 1 - rows) % self.n_rows
+        following = self._ring.stored(steps + 1, envs)
         ended = self.endings[rows, envs] != 0
         if only_stored:
             ended &= steps >= self._n_added - self.size()
         positions = np.flatnonzero(ended)
         if len(positions):
             self._finals.replace_in(following, positions, (steps * self.n_envs + envs)[positions])
-        return following
+        return self._ring.with_older_frames(following, steps, envs, before)
 
     def to_torch(self, array: np.ndarray, copy: bool = True) -> th.Tensor:
         """See SB3's ``to_torch``; the tensor is of a type that torch computes with."""
         return super().to_torch(computable(array), copy)
 
     def _to_tensors(self, rows: Rows, env: VecNormalize | None) -> dict[str, th.Tensor]:
-        """One tensor per storage type, of which the entries are views; entry by entry only where they are normalised."""
+        """One tensor per group, of which the entries are views; entry by entry only where they are normalised."""
         if env is not None:
             normalized = self._normalize_obs(self.layout.unpack(rows), env)
             assert isinstance(normalized, dict)
@@ -331,16 +342,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
         observation = {}
         for key, (group, columns) in self.layout.columns.items():
             values = tensors[group][:, columns]
-            if self.layout.dtypes[key].name != group:
+            if self.layout.dtypes[key] != self.layout.group_dtypes[group]:
                 values = values.to(th.float32)
             observation[key] = values.reshape(-1, *self.layout.shapes[key])
         return observation
-
-    def _check_memory(self, transition_bytes: int) -> None:
-        needed, available = transition_bytes * self.n_rows * self.n_envs, psutil.virtual_memory().available
-        if needed > available:
-            raise MemoryError(
-                f"A replay buffer of {self.buffer_size * self.n_envs:,} transitions needs {needed / 1e9:.2f} GB, but "
-                f"{available / 1e9:.2f} GB are available: lower buffer_size to at most "
-                f"{int(available // transition_bytes):,}, or set replay_buffer_kwargs={{'storage_dtype': 'float16'}}."
-            )

@@ -19,6 +19,17 @@ class Histories(NamedTuple):
     actions: th.Tensor
     mask: th.Tensor
 
+    @classmethod
+    def of(cls, entries: dict[str, th.Tensor], actions: th.Tensor, mask: th.Tensor) -> "Histories":
+        """
+        :param entries: dict of entries, (K * B, ...) of each, whatever they are before an episode's start
+        :param actions: shape (K, B, A)
+        :param mask: shape (K, B)
+        """
+        observations = {key: entry.unflatten(0, mask.shape) for key, entry in entries.items()}
+        ones = {key: mask.view(*mask.shape, *[1] * (entry.dim() - 2)) for key, entry in observations.items()}
+        return cls({key: entry * ones[key].to(entry.dtype) for key, entry in observations.items()}, actions, mask)
+
 
 def check_samples_histories(replay_buffer_class: type | None) -> None:
     """

@@ -1,9 +1,10 @@
 """Where a replay buffer keeps dict observations: each once, all entries of a row side by side."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+import psutil
 from gymnasium import spaces
 
 from sb3_gac.checks.entries import stored_shape
@@ -13,14 +14,16 @@ Rows = dict[str, np.ndarray]
 
 class ObservationLayout:
     """
-    Packs a dict observation into one row per storage type, so that a batch is gathered in one call for all entries.
+    Packs a dict observation into one row per group, so that a batch is gathered in one call for all entries of a group: those
+    that are stored in the same type, or a stack of frames, of which a row of its own holds the newest one alone.
 
     :param space: of the observations
     :param float_dtype: how floating-point entries are stored, ``None`` for their own type
+    :param frame_stacks: entry -> number of its frames, see :func:`sb3_gac.replay.frame_stack.resolve_frame_stacks`
     :raises ValueError: if that is no floating-point type
     """
 
-    def __init__(self, space: spaces.Dict, float_dtype: np.dtype | None = None):
+    def __init__(self, space: spaces.Dict, float_dtype: np.dtype | None = None, frame_stacks: Mapping[str, int] | None = None):
         if float_dtype is not None and not np.issubdtype(float_dtype, np.floating):
             raise ValueError(f'storage_dtype must be a floating-point type such as "float16", or None, got "{float_dtype}".')
         self.shapes = {key: stored_shape(entry) for key, entry in space.spaces.items()}
@@ -28,34 +31,57 @@ class ObservationLayout:
         self.dtypes = {key: np.dtype(entry.dtype) for key, entry in space.spaces.items()}
         self.columns: dict[str, tuple[str, slice]] = {}
         self.widths: dict[str, int] = {}
+        self.group_dtypes: dict[str, np.dtype] = {}
+        #: Group -> frames of its entry, of which one is stored
+        self.lengths: dict[str, int] = {}
         for key, shape in self.shapes.items():
             is_float = np.issubdtype(self.dtypes[key], np.floating)
-            group = np.dtype(float_dtype if is_float and float_dtype is not None else self.dtypes[key]).name
+            dtype = np.dtype(float_dtype if is_float and float_dtype is not None else self.dtypes[key])
+            group = dtype.name
+            if key in (frame_stacks or {}):
+                group = f"frames of {key}"
+                self.lengths[group] = (frame_stacks or {})[key]
             start = self.widths.get(group, 0)
             self.widths[group] = start + int(np.prod(shape))
+            self.group_dtypes[group] = dtype
             self.columns[key] = (group, slice(start, self.widths[group]))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Buffers that were saved before shapes were compared do not say which ones they were given."""
+        """Buffers of earlier versions do not say which shapes they were given, and have no stacks of frames."""
         given = {key: () if shape == (1,) else shape for key, shape in state["shapes"].items()}
-        vars(self).update({"_given_shapes": given, **state})
+        dtypes = {group: np.dtype(group) for group in state["widths"]} if "group_dtypes" not in state else {}
+        vars(self).update({"_given_shapes": given, "group_dtypes": dtypes, "lengths": {}, **state})
+
+    def stored_width(self, group: str) -> int:
+        """
+        :param group: of the layout
+        :return: its last columns that a row of the ring holds: all, or of a stack those of its newest frame
+        """
+        return self.widths[group] // self.lengths.get(group, 1)
 
     def row_bytes(self) -> int:
-        """Bytes of one packed observation."""
-        return sum(width * np.dtype(group).itemsize for group, width in self.widths.items())
+        """Bytes of what is stored of one observation, the ages of stacks included."""
+        return sum(self.stored_width(group) * dtype.itemsize for group, dtype in self.group_dtypes.items()) + len(self.lengths)
 
     def empty(self, *leading: int) -> Rows:
         """
         :param leading: dimensions before the columns
-        :return: storage type -> zeros of shape (\\*leading, width)
+        :return: group -> zeros of shape (\\*leading, stored width)
         """
-        return {group: np.zeros((*leading, width), dtype=group) for group, width in self.widths.items()}
+        return {group: np.zeros((*leading, self.stored_width(group)), dtype) for group, dtype in self.group_dtypes.items()}
+
+    def stored(self, rows: Rows) -> Rows:
+        """
+        :param rows: group -> shape (n, width)
+        :return: what is stored of them, group -> shape (n, stored width)
+        """
+        return {group: values[:, self.widths[group] - self.stored_width(group) :] for group, values in rows.items()}
 
     def pack(self, observation: Mapping[str, np.ndarray], n_rows: int) -> Rows:
         """
         :param observation: ``n_rows`` of each entry
         :param n_rows: number of environments
-        :return: storage type -> shape (n_rows, width)
+        :return: group -> shape (n_rows, width)
         :raises ValueError: naming the entry that is missing, unknown or of another shape, or that holds a number too large
             for the type it is stored in
         """
@@ -64,7 +90,7 @@ class ObservationLayout:
                 f"The replay buffer stores the entries {sorted(self.columns)}, but got an observation with "
                 f"{sorted(observation)}: pass it observations of its observation_space."
             )
-        rows = {group: np.empty((n_rows, width), dtype=group) for group, width in self.widths.items()}
+        rows = {group: np.empty((n_rows, width), dtype=self.group_dtypes[group]) for group, width in self.widths.items()}
         for key, (group, columns) in self.columns.items():
             values = np.asarray(observation[key])
             if values.shape not in ((n_rows, *self.shapes[key]), (n_rows, *self._given_shapes[key])):
@@ -72,14 +98,14 @@ class ObservationLayout:
                     f'The replay buffer stores entry "{key}" in the shape {(n_rows, *self.shapes[key])}, environments first, '
                     f"but got {values.shape}: pass it observations of its observation_space."
                 )
-            if group != values.dtype.name:
-                _check_range(key, values, np.dtype(group))
+            if self.group_dtypes[group] != values.dtype:
+                _check_range(key, values, self.group_dtypes[group])
             rows[group][:, columns] = values.reshape(n_rows, -1)
         return rows
 
     def unpack(self, rows: Rows) -> dict[str, np.ndarray]:
         """
-        :param rows: storage type -> shape (\\*leading, width)
+        :param rows: group -> shape (\\*leading, width)
         :return: entry -> shape (\\*leading, \\*entry shape), in the entry's own type; views where the type is stored as it is
         """
         observation = {}
@@ -105,17 +131,40 @@ def _check_range(key: str, values: np.ndarray, stored: np.dtype) -> None:
         )
 
 
-class FinalObservations:
+def check_fits_in_memory(n_transitions: int, n_rows: int, row_bytes: int) -> None:
     """
-    The observations that no later row holds: those at episode ends. First in, first out, as the ring overwrites them.
+    :param n_transitions: that a buffer is to hold
+    :param n_rows: that it needs for them, of all environments
+    :param row_bytes: of each
+    :raises MemoryError: with the numbers, if the memory that is available is less
+    """
+    needed, available = row_bytes * n_rows, psutil.virtual_memory().available
+    if needed > available:
+        raise MemoryError(
+            f"A replay buffer of {n_transitions:,} transitions needs {needed / 1e9:.2f} GB, but {available / 1e9:.2f} GB are "
+            f"available: lower buffer_size to at most {int(available // row_bytes):,}, or set "
+            "replay_buffer_kwargs={'storage_dtype': 'float16'}, or of stacked images {'frame_stacks': {entry: frames}}."
+        )
 
-    :param layout: of the observations
+
+class RowLayout(Protocol):
+    """What rows consist of."""
+
+    def empty(self, *leading: int) -> Rows:
+        """See :meth:`ObservationLayout.empty`."""
+
+
+class RowsApart:
+    """
+    Rows that a ring does not hold, each with a time. First in, first out, as the ring overwrites what they belong to.
+
+    :param layout: of the rows
     """
 
-    def __init__(self, layout: ObservationLayout):
+    def __init__(self, layout: RowLayout):
         self._layout = layout
-        self._times = np.empty(16, dtype=np.int64)
-        self._rows = layout.empty(16)
+        self._times = np.empty(0, dtype=np.int64)
+        self._rows = layout.empty(0)
         self._first, self._end = 0, 0
 
     def __len__(self) -> int:
@@ -140,7 +189,7 @@ class FinalObservations:
     def append(self, times: np.ndarray, rows: Rows) -> None:
         """
         :param times: increasing, and not before the latest step that was appended, shape (n,)
-        :param rows: storage type -> shape (n, width)
+        :param rows: group -> shape (n, width)
         """
         count = len(times)
         if self._end + count > len(self._times):
@@ -166,11 +215,27 @@ class FinalObservations:
         """
         self._end = self._first + int(np.searchsorted(self._times[self._first : self._end], time))
 
+    @property
+    def rows(self) -> Rows:
+        """Group -> shape (allocated, width); which of them are whose, :meth:`find` says."""
+        return self._rows
+
+    def find(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param times: under which rows may have been appended, shape (B,)
+        :return: their places in :attr:`rows`, and whether they are there, shape (B,)
+        """
+        kept = self._times[self._first : self._end]
+        index = np.searchsorted(kept, times)
+        found = index < len(kept)
+        found[found] = kept[index[found]] == times[found]
+        return self._first + index, found
+
     def replace_in(self, rows: Rows, positions: np.ndarray, times: np.ndarray) -> None:
         """
-        :param rows: storage type -> shape (B, width), changed in place
-        :param positions: which of the B rows end an episode
-        :param times: the times under which their final observations were appended
+        :param rows: group -> shape (B, width), changed in place
+        :param positions: which of the B rows are to be replaced
+        :param times: under which their replacements were appended
         """
         index = self._first + np.searchsorted(self._times[self._first : self._end], times)
         for group, values in rows.items():
@@ -192,3 +257,7 @@ class FinalObservations:
         for group, values in rows.items():
             values[: len(self)] = self._rows[group][kept]
         self._times, self._rows, self._first, self._end = times, rows, 0, len(self)
+
+
+class FinalObservations(RowsApart):
+    """The observations that no later row holds: those at episode ends."""

@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from sb3_gac import GAC, RMA, AsymmetricMPO, AsymmetricSAC, CheckpointError
 from sb3_gac.envs import SensorNoise
 from sb3_gac.replay.buffer import CUT
+from tests.envs.rendering import needs_rendering
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
 from tests.registry import algorithms, make
 
@@ -35,6 +36,19 @@ def _hopper(n_envs=2):
     return make_vec_env("sb3_gac/Hopper-v5", n_envs, seed=1, env_kwargs={"noise_std": 0.1})
 
 
+def _hopper_from_pixels():
+    needs_rendering()
+    return make_vec_env("sb3_gac/HopperPixels-v5", 2, seed=1, env_kwargs={"size": 36})
+
+
+IMAGES = {
+    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}},
+    "role_keys": {"critic": ["privileged"], "guider": ["privileged"]},
+    "replay_buffer_kwargs": {"frame_stacks": {"partial": 3}},
+    "buffer_size": 50,
+    "batch_size": 4,
+    "random_shift": 4,
+}
 GRU = {
     "policy_kwargs": {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8]},
     "batch_size": 4,
@@ -60,6 +74,7 @@ CASES = {  # name -> environment, algorithm and arguments
     "recurrent": (lambda: DummyVecEnv([Recall] * 2), GAC, GRU),
     "two phases, a full buffer": (lambda: _bandits(2), RMA, {"history": 4, "buffer_size": 100}),
     "two phases, discrete": (lambda: _bandits(1, TwoViewChoice), RMA, {"history": 1, "phase_1_steps": N}),
+    "images": (_hopper_from_pixels, GAC, IMAGES),
     "warm-up": (_bandits, GAC, {"learning_starts": N + 20}),
 }
 

@@ -61,6 +61,7 @@ SHARED = {
     ),
     "behaviour_per": (["step", 2, None], r"behaviour_per must be one of \['environment', 'episode'\]"),
     "recording": ([3, True, ["a.npz"]], "recording must be a path or None"),
+    "random_shift": ([-1, 1.5, "far", None], "random_shift must be an integer >= 0"),
     "compile": (["yes", 2, None], r"compile must be one of \[False, True\]"),
     "mixed_precision": (["bfloat16", 2, None], r"mixed_precision must be one of \[False, True\]"),
     "stats_window_size": ([0, -1, 1.5, None], "stats_window_size must be an integer >= 1"),
@@ -126,7 +127,7 @@ OFF_POLICY |= {
     "update_every",
     "behaviour",
 }
-OFF_POLICY |= {"behaviour_per", "recording", "replay_buffer_class", "replay_buffer_kwargs"}
+OFF_POLICY |= {"behaviour_per", "recording", "random_shift", "replay_buffer_class", "replay_buffer_kwargs"}
 ON_POLICY = {name: entry for name, entry in SHARED.items() if name not in OFF_POLICY} | {
     "n_epochs": ([0, -1, 1.5, None], "n_epochs must be an integer >= 1"),
     "gae_lambda": ([-0.1, 1.1, NAN, "far", None], "gae_lambda must be a number from 0 to 1"),

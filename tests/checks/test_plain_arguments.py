@@ -95,6 +95,7 @@ SHARED = {
     "max_grad_norm": np.array([0.5]),
     "lr_scales": {"critic": np.array([3.0])},
     "policy_delay": np.int64(1),
+    "random_shift": np.int64(0),
     "update_every": {"critic": np.int64(1)},
     "compile": np.bool_(False),
     "mixed_precision": np.bool_(False),

@@ -73,6 +73,7 @@ _SINGLE = "sb3_gac.envs.vector.single:make_single"
 SUITES = {
     "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True, history=True),
     "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True, history=True),
+    "pixels": Suite("sb3_gac.envs.suites.pixels", preset="pixels"),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
     "playground": Suite(
         "sb3_gac.envs.suites.playground", sensor_noise=True, extra="envpool", preset="playground", noise_std=0.0

@@ -1,0 +1,103 @@
+"""What a camera in MuJoCo's simulator sees, in place of an entry of the observation."""
+
+from copy import copy
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_gac.envs.spaces import PARTIAL
+from sb3_gac.envs.wrappers import EntryWrapper
+
+#: Around and along a capsule: fewer than MuJoCo's 28 and 16, which 64 pixels do not show
+SLICES, STACKS = 12, 6
+HOW_TO_RENDER = (
+    "On Linux without a screen: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri, and set the environment variable "
+    "MUJOCO_GL=egl before Python starts; MUJOCO_GL=osmesa with libosmesa6 does without EGL."
+)
+
+
+class NoRenderingError(RuntimeError):
+    """There is no OpenGL that MuJoCo can draw with."""
+
+
+class CameraImage(EntryWrapper):
+    """
+    Replace one entry by what a camera sees: uint8, shape (3, size, size).
+
+    Shadows, reflections and smooth edges are left out, which makes drawing in software tens of times faster; the environment's
+    own ``render`` has them as before. Drawing begins with the first reset.
+
+    :param env: of gymnasium's MuJoCo, with a Dict observation
+    :param size: pixels of each side
+    :param camera: its name in the model
+    :param key: the entry
+    :raises ValueError: if the environment has no such camera, or ``size`` is not positive
+    """
+
+    def __init__(self, env: gym.Env, size: int = 64, camera: str = "track", key: str = PARTIAL):
+        super().__init__(env, key)
+        model: Any = getattr(env.unwrapped, "model", None)
+        if type(model).__name__ != "MjModel":
+            raise ValueError(f"CameraImage needs an environment of gymnasium's MuJoCo, but got {env.unwrapped}.")
+        cameras = [model.camera(number).name for number in range(model.ncam)]
+        if camera not in cameras:
+            raise ValueError(f"camera must be one of {cameras}, got {camera!r}.")
+        if size < 1:
+            raise ValueError(f"size must be at least 1 pixel, got {size}.")
+        self._size, self._camera = size, camera
+        self._renderer: Any = None
+        self._set_entry_space(spaces.Box(0, 255, (3, size, size), np.uint8))
+
+    def close(self) -> None:
+        """Of the camera and of the environment."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        super().close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy, in another process for one, draws with a context of its own."""
+        return {**vars(self), "_renderer": None}
+
+    def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
+        return self._image()
+
+    def _next(self, value: np.ndarray, action: Any, reward: Any) -> np.ndarray:
+        return self._image()
+
+    def _image(self) -> np.ndarray:
+        simulator: Any = self.env.unwrapped
+        if self._renderer is None:
+            self._renderer = make_renderer(simulator.model, self._size)
+        self._renderer.update_scene(simulator.data, camera=self._camera)
+        return np.ascontiguousarray(self._renderer.render().transpose(2, 0, 1))
+
+
+def make_renderer(model: Any, size: int) -> Any:
+    """
+    :param model: of MuJoCo, which stays as it is
+    :param size: pixels of each side
+    :return: MuJoCo's renderer, with the settings that are fast in software
+    :raises NoRenderingError: saying what to install and to set
+    """
+    import mujoco
+
+    fast = copy(model)
+    fast.vis.quality.shadowsize = 0
+    fast.vis.quality.offsamples = 0
+    fast.vis.quality.numslices, fast.vis.quality.numstacks = SLICES, STACKS
+    fast.vis.global_.offwidth = fast.vis.global_.offheight = size
+    fast.mat_reflectance[:] = 0
+    try:
+        return mujoco.Renderer(fast, size, size)
+    except Exception as error:
+        raise no_rendering(error) from error
+
+
+def no_rendering(error: Exception) -> NoRenderingError:
+    """
+    :param error: MuJoCo's, which depends on what is missing
+    """
+    return NoRenderingError(f"MuJoCo can't draw images here ({type(error).__name__}: {error}). {HOW_TO_RENDER}")
