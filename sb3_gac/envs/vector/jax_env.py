@@ -80,14 +80,14 @@ class JaxVecEnv(BatchVecEnv):
         self._of_seeds = np.asarray(seeds, dtype=np.uint64).astype(np.uint32)
         self._episodes[:] = 0
         self._state = self._blank()
-        return self._begin(np.arange(self.num_envs))
+        return self._place_first(np.arange(self.num_envs))
 
     def restart(self, indices: np.ndarray) -> SimulatorObservation:
         """See :class:`~sb3_gac.envs.vector.base.BatchVecEnv`."""
         self._episodes[indices] += 1
-        return self._begin(indices)
+        return self._place_first(indices)
 
-    def _begin(self, indices: np.ndarray) -> SimulatorObservation:
+    def _place_first(self, indices: np.ndarray) -> SimulatorObservation:
         """Episodes of some environments, a chunk at a time: to reset all of them takes about as long as a step."""
         for start in range(0, len(indices), self._chunk):
             rows = np.full(self._chunk, self.num_envs)  # where there is nothing to be placed
