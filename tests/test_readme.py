@@ -35,8 +35,9 @@ def _names_by_then():
 
 @pytest.mark.parametrize("number", range(len(BLOCKS)))
 def test_the_python_of_the_readme_runs(number, tmp_path, monkeypatch):
-    if "popgym" in BLOCKS[number]:
-        pytest.importorskip("popgym")
+    for simulator, named in {"popgym": "popgym", "envpool": "EnvPool"}.items():
+        if named in BLOCKS[number]:
+            pytest.importorskip(simulator, reason=f"the block needs {named}")
     monkeypatch.chdir(tmp_path)
     exec(compile(_shorter(BLOCKS[number]), f"README.md, block {number}", "exec"), _names_by_then())
 

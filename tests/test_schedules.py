@@ -59,7 +59,7 @@ def test_what_is_no_schedule_is_refused_and_the_argument_named(text, said):
     with pytest.raises(ValueError, match=said):
         read_schedule(text)
     for argument in ("target_kl", "learning_rate", "guidance"):
-        with pytest.raises(ValueError, match=f"{argument}: .*{said}"):
+        with pytest.raises(ValueError, match=f"{argument} must be a number >.*{said}"):
             small_model(**{argument: text})
     with pytest.raises(ValueError, match=f"behaviour, learner: .*{said}"):
         Behaviour(Roles("learner", ("guider",), ("critic",)), {"learner": text})

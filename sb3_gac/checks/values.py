@@ -157,7 +157,7 @@ def check_schedule(name: str, value: Any, remedy: str = "or a schedule", may_be_
         try:
             value = read_schedule(value)
         except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
+            raise ValueError(f"{name} must be a number {'>=' if may_be_zero else '>'} 0, {remedy}; {error}") from None
     if not callable(value):
         (check_not_negative if may_be_zero else check_positive)(name, value, remedy)
         return

@@ -245,7 +245,7 @@ def test_training_takes_a_teacher_and_acting_takes_none(tmp_path):
     robot, obs = COSIL.load(tmp_path / "student"), {"partial": np.ones(2, np.float32)}
     np.testing.assert_array_equal(robot.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
     with pytest.raises(ValueError, match="COSIL trains with a teacher: pass teacher="):
-        small_model(None, COSIL).learn(20)
+        small_model(None, COSIL, teacher=None).learn(20)
 
 
 # --- all of it together -------------------------------------------------------------------------------------------------

@@ -106,7 +106,7 @@ def test_to_train_takes_a_teacher_and_to_act_takes_none(tmp_path):
     again = TGRL.load(tmp_path / "student", env=TwoViewBandit(), teacher=str(tmp_path / "moved.zip"))
     assert again.learn(20, reset_num_timesteps=False).num_timesteps == 50
     with pytest.raises(ValueError, match=r"TGRL trains with a teacher: pass teacher=<a trained model or its path>"):
-        small_model(cls=TGRL).learn(20)
+        small_model(cls=TGRL, teacher=None).learn(20)
 
 
 # --- who acts, and what follows from it --------------------------------------------------------------------------------------

@@ -240,7 +240,7 @@ def test_a_teacher_by_its_path_is_the_same_one(tmp_path):
 
 
 def test_training_needs_a_teacher_and_acting_does_not():
-    model = small_model(cls=TGRL)
+    model = small_model(cls=TGRL, teacher=None)
     model.predict(TwoViewBandit().reset(seed=0)[0])
     with pytest.raises(ValueError, match="TGRL trains with a teacher"):
         model.learn(5)

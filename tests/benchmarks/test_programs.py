@@ -19,6 +19,7 @@ import pandas as pd
 import pytest
 import torch as th
 import yaml
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import ConvertCallback
 
 import benchmarks.config
@@ -36,7 +37,7 @@ from benchmarks.suite import RunSpec, made_with, read_suite
 from sb3_gac import GAC, PRESETS, preset
 from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.presets import instantiate, read_preset
-from tests.helpers import small_model
+from tests.helpers import Sampled, small_model
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "benchmarks" / "suites" / "smoke.yml"
@@ -483,6 +484,9 @@ def test_tasks_without_sensor_noise_have_none():
         environment(replace(spec, task="popgym-Chess"))
 
 
+PIXELS = spaces.Dict(partial=spaces.Box(0, 255, (3, 36, 36), np.uint8), privileged=spaces.Box(-1, 1, (2,), np.float32))
+
+
 def test_every_algorithm_fits_every_preset():
     algorithms = set(yaml.safe_load((ROOT / "benchmarks/hyperparams/algorithms.yml").read_text()))
     for preset_name in PRESETS:
@@ -490,7 +494,7 @@ def test_every_algorithm_fits_every_preset():
             algorithm_class, arguments = resolve(RunSpec(algorithm, "Ant", 0.1, 0, 1000, 4, preset_name, 500, 1))
             if issubclass(algorithm_class, Program):
                 continue
-            env = gym.make("sb3_gac/InvertedDoublePendulum-v5")
+            env = Sampled(PIXELS) if preset_name == "pixels" else gym.make("sb3_gac/InvertedDoublePendulum-v5")
             settings = {"policy": "MultiInputPolicy", **instantiate(arguments), "device": "cpu"}
             small = {"buffer_size": 1_000} if "buffer_size" in constructor_parameters(algorithm_class) else {}
             algorithm_class(env=env, **settings | small)

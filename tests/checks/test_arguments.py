@@ -96,9 +96,10 @@ GACS_OWN = {
     ),
     "kl_coef_learning_rate": ([0, -1, NAN, "fast", None], "kl_coef_learning_rate must be a number > 0"),
     "kl_reduction": (["max", None, 3], r"kl_reduction must be one of \['mean', 'sum'\]"),
-    "guider": (["teacher", None, []], r"guider must be one of \['independent', 'residual'\]"),
+    "guider": (["teacher", None, []], r"guider must be one of \['independent', 'lagged', 'residual'\]"),
     "shared_std": (["nobody", None, 1], r"shared_std must be one of \['auto', 'guider', 'learner'\]"),
     "max_kl": ([0, -1, NAN, INF, "tight"], "max_kl must be a number > 0, or None"),
+    "guidance": ([-1, NAN, INF, "hard", None], r"guidance( at the (start|end) of training)? must be a number >= 0"),
     "learner_kl_scale": ([-1, NAN, INF, "full", None], 'learner_kl_scale must be a number >= 0, or "auto"'),
     "learner_entropy": (["yes", 2, None], r"learner_entropy must be one of \[False, True\]"),
 }

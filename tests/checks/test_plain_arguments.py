@@ -113,6 +113,7 @@ SHARED = {
 }
 GACS_OWN = {
     "target_kl": np.float64(0.01),
+    "guidance": np.float32(0.0),  # which GACWithoutQ takes too
     "behaviour": {"learner": np.float32(0.25)},
     "kl_coef_bounds": np.array([1e-3, 10.0]),
     "kl_coef_learning_rate": np.float64(1e-2),

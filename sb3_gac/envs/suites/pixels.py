@@ -60,6 +60,7 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
         "entry_point": f"{__name__}:make_pixels",
         "max_episode_steps": 1000,
         "kwargs": {"task": task},
+        "whole_state": True,
     }
     for task in TASKS
 }
