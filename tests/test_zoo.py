@@ -131,7 +131,9 @@ def test_every_algorithm_has_hyperparameters_that_it_takes_for_every_registered_
     of_mujoco = {f"sb3_gac/{task}-v5" for task in envs.suites.mujoco.TASKS}
     of_playground = {f"sb3_gac/{task}-v0" for task in envs.suites.playground.TASKS}
     of_brax = {f"sb3_gac/brax-{task}-v0" for task in envs.suites.brax.TASKS}
-    assert set(settings) == {"default", "sb3_gac/Pendulum-v1", *of_mujoco, *of_playground, *of_brax}
+    of_pixels = {f"sb3_gac/{task}Pixels-v5" for task in envs.suites.pixels.TASKS}
+    with_whole_state = {"sb3_gac/Pendulum-v1", *of_mujoco, *of_playground, *of_brax, *of_pixels}
+    assert set(settings) == {"default", *with_whole_state}
     of_critics = None if algorithm in ("cosil", "rma") else {"critic": ["privileged"]}  # theirs see what the preset can't say
     assert settings[ENV]["role_keys"] == of_critics
     assert "role_keys" not in settings["default"], "elsewhere the privileged entry may not be the whole state"
