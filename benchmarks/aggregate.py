@@ -11,9 +11,10 @@ from the results that they were aggregated to.  Intervals are stratified bootstr
 import argparse
 import json
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from itertools import combinations, permutations
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -41,6 +42,9 @@ CELL = ["task", "noise"]
 REFERENCE = "sac-asym"
 STEADY_FROM = 5_000
 BOOTSTRAPS = 2_000
+#: A value, and the ends of its interval
+Estimate = tuple[float, tuple[float, float]]
+Name = TypeVar("Name", bound=Hashable)
 
 
 def finished_runs(
@@ -216,7 +220,6 @@ def compare(tidy: pd.DataFrame) -> dict[str, Any]:
     compared = scores[scores.algorithm.isin(names)].sort_values("seed", kind="stable")
     compared = compared.groupby([*CELL, "algorithm"], sort=False).head(runs)
     matrices = {name: _runs_by_cell(compared[compared.algorithm == name]) for name in names}
-    pairs = {f"{one} over {other}": (matrices[one], matrices[other]) for one in names for other in names if one != other}
     return {
         "compared": {
             "algorithms": names,
@@ -224,8 +227,21 @@ def compare(tidy: pd.DataFrame) -> dict[str, Any]:
             "cells": _compared_cells(compared),
         },
         "normalised_iqm": _rounded(_estimate(matrices, metrics.aggregate_iqm)),
-        "probability_of_improvement": _rounded(_estimate(pairs, metrics.probability_of_improvement)),
+        "probability_of_improvement": _rounded(_improvements(matrices)),
     }
+
+
+def _improvements(matrices: dict[str, np.ndarray]) -> dict[str, Estimate]:
+    """Of each over each other; the second of two is the first's complement, and is not drawn anew."""
+    pairs = {(one, other): (matrices[one], matrices[other]) for one, other in combinations(matrices, 2)}
+    estimates = _estimate(pairs, metrics.probability_of_improvement)
+    estimates |= {(other, one): _complement(estimate) for (one, other), estimate in estimates.items()}
+    return {f"{one} over {other}": estimates[one, other] for one, other in permutations(matrices, 2)}
+
+
+def _complement(estimate: Estimate) -> Estimate:
+    point, (low, high) = estimate
+    return 1 - point, (1 - high, 1 - low)
 
 
 def _runs_by_cell(of_algorithm: pd.DataFrame) -> np.ndarray:
@@ -245,7 +261,7 @@ def _compared_cells(compared: pd.DataFrame) -> list[dict[str, Any]]:
     ]
 
 
-def _estimate(scores: dict[str, Any], metric: Callable[..., float]) -> dict[str, tuple[float, tuple[float, float]]]:
+def _estimate(scores: dict[Name, Any], metric: Callable[..., float]) -> dict[Name, Estimate]:
     """Point estimate and interval, the same for the same scores: rliable draws from numpy's global generator."""
     if not scores:
         return {}
@@ -260,7 +276,7 @@ def _estimate(scores: dict[str, Any], metric: Callable[..., float]) -> dict[str,
     return {name: (float(points[name][0]), (float(intervals[name][0, 0]), float(intervals[name][1, 0]))) for name in scores}
 
 
-def _rounded(estimates: dict[str, tuple[float, tuple[float, float]]]) -> dict[str, list[float]]:
+def _rounded(estimates: dict[str, Estimate]) -> dict[str, list[float]]:
     return {name: [round(value, 3) for value in (point, low, high)] for name, (point, (low, high)) in estimates.items()}
 
 

@@ -153,3 +153,13 @@ def test_scores_lie_between_the_lowest_point_of_any_curve_and_the_best_end(one, 
     assert scores.low.unique().tolist() == [low]
     assert scores.high.unique().tolist() == [high]
     assert scores.normalised.tolist() == pytest.approx([(end - low) / (high - low) for end in (one[-1], other[-1])])
+
+
+def test_the_probability_of_the_other_way_round_is_the_complement():
+    finals = {(name, "T"): np.random.RandomState(seed).normal(size=5) for seed, name in enumerate(("gac", "sac", "tgrl"))}
+    chances = compare(_finals(finals))["probability_of_improvement"]
+    assert list(chances) == [f"{a} over {b}" for a in ("gac", "sac", "tgrl") for b in ("gac", "sac", "tgrl") if a != b]
+    for one, other in (("gac", "sac"), ("gac", "tgrl"), ("sac", "tgrl")):
+        point, low, high = chances[f"{one} over {other}"]
+        assert chances[f"{other} over {one}"] == pytest.approx([1 - point, 1 - high, 1 - low], abs=2e-3)
+        assert low <= point <= high
