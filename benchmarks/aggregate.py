@@ -329,8 +329,12 @@ def _distinct(origins_of_runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [origin for index, origin in enumerate(origins_of_runs) if origin not in origins_of_runs[:index]]
 
 
-def main() -> None:
-    """Command line."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    Command line.
+
+    :param arguments: by default the process's
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suite", type=Path)
     parser.add_argument("--runs", type=Path, default=RUNS)
@@ -338,7 +342,7 @@ def main() -> None:
     parser.add_argument("--reference", help=f"to whose final return steps are counted: {REFERENCE}, or the first, by default")
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
     add_reuse_options(parser)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     runs, missing = finished_runs(options.suite, options.runs, options.complete_cells, options.reuse_results, options.rerun)
     evaluations = options.out.with_suffix(".csv")
     options.out.parent.mkdir(parents=True, exist_ok=True)

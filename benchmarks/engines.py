@@ -67,7 +67,8 @@ class RayEngine:
             import ray
         except ImportError:
             raise ImportError('--engine ray needs Ray: pip install "sb3_gac[ray]".') from None
-        environment = {"env_vars": {"PYTHONPATH": str(HERE.parent)}}
+        path = [str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(path)}}
         ray.init(address, log_to_driver=False, runtime_env=environment, ignore_reinit_error=True)
         self._ray = ray
         self._run = ray.remote(num_cpus=1, max_retries=NODE_LOSSES)(run_process)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
@@ -63,13 +64,22 @@ def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = 
 
 def make_wrapped(env_id: str, kwargs: Mapping[str, Any], wrappers: Sequence[Mapping[str, Mapping[str, Any]]]) -> gym.Env:
     """
-    :param env_id: of gymnasium, after the module that registers it and a colon if need be
+    :param env_id: of gymnasium, after the module that registers it and a colon if need be; or ``module:name`` of a class or
+        function that makes an environment
     :param kwargs: of the environment
     :param wrappers: from the inside to the outside, each ``module:Class`` and its keyword arguments
     :raises ValueError: if a wrapper can't be imported
     """
-    env = gym.make(env_id, **kwargs)
+    env = _make(env_id, kwargs)
     for wrapper in wrappers:
         for path, arguments in wrapper.items():
             env = import_path(path)(env, **arguments)
     return env
+
+
+def _make(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env:
+    module, _, name = env_id.rpartition(":")
+    if module and name.isidentifier() and callable(getattr(import_module(module), name, None)):
+        env: gym.Env = import_path(env_id)(**kwargs)
+        return env
+    return gym.make(env_id, **kwargs)

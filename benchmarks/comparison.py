@@ -1,0 +1,240 @@
+"""A comparison on one task: a suite that follows from command-line options, its runs, and a page; :mod:`sb3_gac.compare`."""
+
+import argparse
+import json
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from benchmarks import aggregate, launch
+from benchmarks.comparison_page import page
+from benchmarks.config import check_programs
+from benchmarks.environments import EVAL_SEED, make_envs
+from benchmarks.finished import read_tidy
+from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, findings, recommendation, worth
+from benchmarks.suite import _NAME as NAME
+from benchmarks.suite import RunSpec, check_is, default_name, read_definitions, read_suite
+from sb3_gac.envs.suites import SUITES, suite_of, task_of
+from sb3_gac.presets import PRESETS, read_preset
+from sb3_gac.train import UniformActions
+
+ALGORITHMS = (FULL, ASYMMETRIC, GUIDED, PARTIAL)
+EVALUATIONS, RANDOM_EPISODES = 20, 30
+#: From as many steps on a compiled gradient step saves more than the half minute that compiling takes
+COMPILED_FROM = 10_000
+_COMPILERS = ("g++", "clang++", "c++")
+_OF_TASKS = {"noise_std", "history"}
+
+
+def parse_arguments(description: str | None, arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """
+    :param description: of the program
+    :param arguments: command line, by default the process's
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_gac.compare", description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    known = sorted(read_definitions())
+    parser.add_argument(
+        "--env", required=True, help="an id, my_module:MyEnv-v0, or my_module:make_env, a class or function that makes one"
+    )
+    parser.add_argument("--env-kwargs", type=_mapping, default={}, metavar="YAML", help='such as "{noise_std: 0.1}"')
+    parser.add_argument(
+        "--wrappers", nargs="+", default=[], metavar="MODULE:CLASS", help="around it, from the inside to the outside"
+    )
+    parser.add_argument(
+        "--whole-state",
+        action="store_true",
+        help="the privileged entry has all that partial shows: critics then see it alone, and no sensor noise",
+    )
+    parser.add_argument(
+        "--algorithms", nargs="+", default=ALGORITHMS, choices=known, metavar="NAME", help=f"of {', '.join(known)}"
+    )
+    parser.add_argument("--seeds", type=_positive, default=5, help="runs of each algorithm (default: 5)")
+    parser.add_argument("--steps", type=_positive, default=20_000, help="of each run (default: 20000)")
+    parser.add_argument("--eval-episodes", type=_positive, default=10, help="of each evaluation (default: 10)")
+    parser.add_argument("--preset", choices=sorted(PRESETS), help="arguments of the algorithms (default: small)")
+    parser.add_argument(
+        "--overrides", type=_mapping, default={}, metavar="YAML", help='of the preset, such as "{gamma: 0.95}"'
+    )
+    parser.add_argument("--jobs", type=_positive, help="runs side by side (default: one on each CPU)")
+    parser.add_argument("--ray", nargs="?", const="auto", metavar="ADDRESS", help="run on a Ray cluster instead")
+    parser.add_argument("--out", type=Path, help="directory of everything (default: comparisons/<environment>)")
+    options = parser.parse_args(arguments)
+    options.out = (options.out or Path("comparisons") / default_name(options.env).replace(":", "-")).resolve()
+    return options
+
+
+def _positive(text: str) -> int:
+    if (value := int(text)) < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {text}")
+    return value
+
+
+def _mapping(text: str) -> dict[str, Any]:
+    try:
+        found = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"is no YAML: {error}") from None
+    if not isinstance(found, Mapping):
+        raise argparse.ArgumentTypeError(f'must be a mapping, such as "{{key: 0.1}}", got {text!r}')
+    return dict(found)
+
+
+def suite_of_options(options: argparse.Namespace) -> dict[str, Any]:
+    """
+    :param options: see :func:`parse_arguments`
+    :return: the suite, as YAML has it
+    """
+    runs = {"algorithms": list(options.algorithms), "seeds": list(range(options.seeds))}
+    cell = _registered(options) or _own(options)
+    preset = read_preset(options.preset or _preset_for(options.env))
+    overrides = dict(options.overrides)
+    if "env" in cell and not options.whole_state:
+        overrides = {"role_keys": None, **overrides}
+    if "compile" not in overrides and options.steps >= COMPILED_FROM and any(map(shutil.which, _COMPILERS)):
+        overrides["compile"] = True
+    return {
+        "steps": options.steps,
+        "envs": preset.envs,
+        "preset": preset.name,
+        "eval_every": max(options.steps // EVALUATIONS // preset.envs, 1) * preset.envs,
+        "eval_episodes": options.eval_episodes,
+        "overrides": overrides,
+        "cells": [cell | runs],
+    }
+
+
+def _registered(options: argparse.Namespace) -> dict[str, Any] | None:
+    """A cell of one of this package's tasks, with its preset's settings, if it is one with no other arguments."""
+    suite = suite_of(options.env)
+    if suite is None or options.wrappers or set(options.env_kwargs) - _OF_TASKS:
+        return None
+    history = {"history": options.env_kwargs["history"]} if "history" in options.env_kwargs else {}
+    default = SUITES[suite].noise_std if SUITES[suite].sensor_noise else 0.0
+    return {"task": task_of(options.env), "noises": [options.env_kwargs.get("noise_std", default)], **history}
+
+
+def _own(options: argparse.Namespace) -> dict[str, Any]:
+    name = default_name(options.env)
+    check_is("--env", name, "an id or module:name whose name has letters, digits and . + - alone", str, NAME.fullmatch)
+    return {"env": options.env, "env_kwargs": options.env_kwargs, "wrappers": options.wrappers, "name": name}
+
+
+def _preset_for(env_id: str) -> str:
+    suite = suite_of(env_id)
+    return "small" if suite is None else SUITES[suite].preset
+
+
+def write_suite(options: argparse.Namespace) -> Path:
+    """
+    :param options: see :func:`parse_arguments`
+    :return: the suite's file
+    """
+    options.out.mkdir(parents=True, exist_ok=True)
+    path: Path = options.out / "suite.yml"
+    path.write_text(f"# {command(options)}\n" + yaml.safe_dump(suite_of_options(options), sort_keys=False))
+    return path
+
+
+def command(options: argparse.Namespace) -> str:
+    """
+    :param options: see :func:`parse_arguments`
+    :return: what makes the same comparison again
+    """
+    given = {
+        "--env": [options.env],
+        "--env-kwargs": [_flow(options.env_kwargs)] if options.env_kwargs else [],
+        "--wrappers": options.wrappers,
+        "--algorithms": options.algorithms if tuple(options.algorithms) != ALGORITHMS else [],
+        "--seeds": [options.seeds],
+        "--steps": [options.steps],
+        "--eval-episodes": [options.eval_episodes],
+        "--preset": [options.preset] if options.preset else [],
+        "--overrides": [_flow(options.overrides)] if options.overrides else [],
+    }
+    words = [str(word) for name, values in given.items() if values for word in (name, *values)]
+    return shlex.join(["python", "-m", "sb3_gac.compare", *words, *(["--whole-state"] * options.whole_state)])
+
+
+def _flow(values: Mapping[str, Any]) -> str:
+    return yaml.safe_dump(dict(values), default_flow_style=True, sort_keys=False, width=10_000).strip()
+
+
+def run(options: argparse.Namespace) -> Path:
+    """
+    Train what is left, and make the page.
+
+    :param options: see :func:`parse_arguments`
+    :return: the page
+    :raises ValueError: if the environment, an algorithm or an argument is wrong; before the first run
+    """
+    suite, runs = write_suite(options), options.out / "runs"
+    # Processes of runs begin elsewhere, and must find modules that are found here
+    os.environ["PYTHONPATH"] = os.pathsep.join([os.getcwd(), *filter(None, [os.environ.get("PYTHONPATH")])])
+    jobs, finished = launch.jobs_left(suite, runs)
+    check_programs(job.spec for job in jobs)
+    print(f"{len(jobs)} runs of {options.steps:,} steps to do, {finished} done; all is in {options.out}.", flush=True)
+    engine = launch.LocalEngine() if options.ray is None else launch.RayEngine(options.ray)
+    launch.launch(jobs, options.jobs or engine.cpus, 1, engine)
+    if failed := [job for job in jobs if job.state == "failed"]:
+        logs = "\n".join(f"  {job.log}" for job in failed)
+        raise ValueError(f"{len(failed)} runs failed. Their logs say why; then the same command goes on:\n{logs}")
+    return write_results(options, suite, runs)
+
+
+def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
+    """
+    :param options: see :func:`parse_arguments`
+    :param suite: its file
+    :param runs: directory of the runs, which are finished
+    :return: the page
+    """
+    results = options.out / "results"
+    aggregate.main([str(suite), "--runs", str(runs), "--out", str(results)])
+    tidy = read_tidy(results.with_suffix(".csv"))
+    found = worth(tidy, random_returns(read_suite(suite)[0], options.out / "random.json"))
+    path: Path = options.out / "index.html"
+    path.write_text(page(tidy, found, command(options), results.with_suffix(".json"), options.steps))
+    print("\n" + "\n".join([*recommendation(found, options.steps), "", *findings(found)]))
+    return path
+
+
+def random_returns(spec: RunSpec, path: Path) -> np.ndarray:
+    """
+    :param spec: of a run
+    :param path: file where they are, or are put
+    :return: returns of episodes with actions at random, on the environments of evaluations
+    """
+    if not path.exists():
+        env = make_envs(spec, spec.eval_episodes)
+        env.seed(EVAL_SEED)
+        returns, _ = evaluate_policy(UniformActions(env), env, RANDOM_EPISODES, return_episode_rewards=True)
+        env.close()
+        path.write_text(json.dumps(returns))
+    return np.array(json.loads(path.read_text()))
+
+
+def main(description: str | None = None) -> None:
+    """
+    Command line.
+
+    :param description: of the program
+    """
+    options = parse_arguments(description)
+    try:
+        print(f"\nPage: {run(options)}")
+    except ValueError as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main()

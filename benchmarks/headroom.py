@@ -1,0 +1,294 @@
+"""
+What privileged information is worth on a task: differences of returns between algorithms that see it at deployment, in
+training, or never, with intervals that hold for few seeds, and what follows from them in words.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
+#: What algorithms are called in sentences
+TITLES = {FULL: "SAC on the full state", ASYMMETRIC: "SAC-asym", GUIDED: "GAC", PARTIAL: "SAC on partial alone"}
+#: Of what can be deployed, the simpler first: where several come equally far, the first is enough
+SIMPLER_FIRST = (PARTIAL, ASYMMETRIC, GUIDED)
+CONFIDENCE = 0.95
+#: Part of a run's evaluations whose mean is its end: one evaluation of a few episodes says little
+END = 0.25
+#: Part of all that was learned that does not matter
+NEGLIGIBLE = 0.05
+#: ... and the part that the number of seeds is worked out for, to be seen in four of five repetitions
+WORTH_SEEING, _POWER_QUANTILES = 0.1, float(stats.norm.ppf(0.975) + stats.norm.ppf(0.8))
+
+
+class Difference(NamedTuple):
+    """
+    Of two algorithms' mean scores.
+
+    :param better: name of the first
+    :param other: name of the one whose mean is taken off
+    :param value: of the difference
+    :param low: end of its interval by Welch's t test; ``-inf`` with a single seed
+    :param high: the other end
+    """
+
+    better: str
+    other: str
+    value: float
+    low: float
+    high: float
+
+    def verdict(self, negligible: float) -> str:
+        """
+        :param negligible: a difference that does not matter
+        :return: "more", "less", "same", if all of the interval does not matter, or "unknown"
+        """
+        if -negligible < self.low and self.high < negligible:
+            return "same"
+        return "more" if self.low > 0 else "less" if self.high < 0 else "unknown"
+
+
+class Worth(NamedTuple):
+    """
+    What privileged information is worth on a task.
+
+    :param ends: algorithm -> mean return over the last quarter of the evaluations, one by seed
+    :param areas: algorithm -> mean return over all evaluations, one by seed
+    :param random: mean return of actions at random, and the ends of its interval
+    :param span: what was learned: from the return of random actions to the best mean end
+    :param headroom: the full state over SAC-asym, if both are there
+    :param in_training: SAC-asym over SAC on partial alone, if both are there
+    :param guider: GAC over SAC-asym, if both are there
+    """
+
+    ends: dict[str, np.ndarray]
+    areas: dict[str, np.ndarray]
+    random: tuple[float, float, float]
+    span: float
+    headroom: Difference | None
+    in_training: Difference | None
+    guider: Difference | None
+
+    @property
+    def learned(self) -> list[str]:
+        """Algorithms of which most seeds end above random actions, beyond chance."""
+        return [name for name, end in self.ends.items() if np.median(end) > self.random[2]]
+
+    @property
+    def deployable(self) -> list[str]:
+        """Algorithms that need no privileged entry at deployment, the simpler first."""
+        others = [name for name in self.ends if name not in (FULL, *SIMPLER_FIRST)]
+        return [name for name in SIMPLER_FIRST if name in self.ends] + others
+
+
+def difference(scores: Mapping[str, np.ndarray], better: str, other: str) -> Difference:
+    """
+    :param scores: algorithm -> one by seed
+    :param better: one of them
+    :param other: another
+    :return: of their means, with Welch's interval: the two may vary differently
+    """
+    one, two = scores[better], scores[other]
+    value = float(one.mean() - two.mean())
+    if min(len(one), len(two)) < 2:
+        return Difference(better, other, value, -math.inf, math.inf)
+    if one.std() == two.std() == 0:
+        return Difference(better, other, value, value, value)
+    low, high = stats.ttest_ind(one, two, equal_var=False).confidence_interval(CONFIDENCE)
+    return Difference(better, other, value, float(low), float(high))
+
+
+def mean_interval(scores: np.ndarray) -> tuple[float, float, float]:
+    """
+    :param scores: one by seed
+    :return: their mean, and the ends of its interval by Student's t, which are infinite with a single seed
+    """
+    mean, count = float(scores.mean()), len(scores)
+    if count < 2:
+        return mean, -math.inf, math.inf
+    half = float(stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) * scores.std(ddof=1) / math.sqrt(count))
+    return mean, mean - half, mean + half
+
+
+def worth(tidy: pd.DataFrame, random_returns: np.ndarray) -> Worth:
+    """
+    :param tidy: evaluations of one task: algorithm, seed, timesteps, learner
+    :param random_returns: of episodes with actions at random
+    :return: what privileged information is worth on it
+    """
+    runs = {
+        key: run.sort_values("timesteps").learner.to_numpy() for key, run in tidy.groupby(["algorithm", "seed"], sort=False)
+    }
+    names = list(dict.fromkeys(name for name, _ in runs))
+
+    def by_algorithm(score: Any) -> dict[str, np.ndarray]:
+        return {name: np.array([score(run) for (owner, _), run in runs.items() if owner == name]) for name in names}
+
+    ends = by_algorithm(lambda run: run[-math.ceil(END * len(run)) :].mean())
+    pairs = ((FULL, ASYMMETRIC), (ASYMMETRIC, PARTIAL), (GUIDED, ASYMMETRIC))
+    differences = [difference(ends, *pair) if set(pair) <= set(ends) else None for pair in pairs]
+    best = max(float(end.mean()) for end in ends.values())
+    random = mean_interval(random_returns)
+    return Worth(ends, by_algorithm(np.mean), random, best - random[0], *differences)
+
+
+def headroom_curve(tidy: pd.DataFrame) -> pd.DataFrame:
+    """
+    :param tidy: see :func:`worth`
+    :return: "timesteps", and "value", "low" and "high" of the full state's mean return over SAC-asym's there; no rows without
+        both
+    """
+    rows = []
+    for step, at_step in tidy.groupby("timesteps"):
+        scores = {str(name): group.learner.to_numpy() for name, group in at_step.groupby("algorithm")}
+        if {FULL, ASYMMETRIC} <= set(scores):
+            of_both = difference(scores, FULL, ASYMMETRIC)
+            rows.append({"timesteps": step, "value": of_both.value, "low": of_both.low, "high": of_both.high})
+    return pd.DataFrame(rows, columns=["timesteps", "value", "low", "high"])
+
+
+def seeds_to_see(found: Worth, part: float = WORTH_SEEING) -> int:
+    """
+    :param found: of runs
+    :param part: of the span
+    :return: seeds of each algorithm with which a difference of that part is seen in four of five repetitions, judged by how
+        much the runs that are there vary
+    """
+    variances = [float(end.var(ddof=1)) for end in found.ends.values() if len(end) > 1]
+    if not variances or found.span <= 0:
+        return 2
+    return max(2, math.ceil(2 * float(np.mean(variances)) * (_POWER_QUANTILES / (part * found.span)) ** 2))
+
+
+def findings(found: Worth) -> list[str]:
+    """
+    :param found: of runs
+    :return: sentences, one for each question that the algorithms answer
+    """
+    told = [(found.headroom, _HEADROOM), (found.in_training, _IN_TRAINING), (found.guider, _GUIDER)]
+    return [_sentence(found, one, texts) for one, texts in told if one is not None]
+
+
+_HEADROOM = {
+    "more": "There is headroom. A policy that saw the privileged entries on the robot too returns {value} more than SAC-asym "
+    "does without them: so much is there for a guider, a memory or more sensors to gain.",
+    "same": "There is no headroom: SAC-asym comes as far without the privileged entries as SAC does with them. No guider and "
+    "no memory can add much to that on this task.",
+    "less": "SAC on the full state ends below SAC-asym, by {value}: with these steps it is not the upper bound that it should "
+    "be. It has more inputs to learn from; give it more --steps before you trust the headroom.",
+    "unknown": "The headroom, the full state over SAC-asym, can't be told: {value}.",
+}
+_IN_TRAINING = {
+    "more": "Privileged information in training alone is worth {value}: so much do critics that see it add to SAC on partial.",
+    "same": "Critics that see the privileged entries add nothing here: SAC on partial alone comes as far as SAC-asym.",
+    "less": "Critics that see the privileged entries do harm ({value}): what they know, the policy can't make use of.",
+    "unknown": "Whether critics that see the privileged entries help can't be told: SAC-asym over SAC on partial is {value}.",
+}
+_GUIDER = {
+    "more": "A guider is worth {value} on top of such critics: GAC over SAC-asym.",
+    "same": "A guider changes nothing on top of such critics: GAC and SAC-asym come equally far.",
+    "less": "A guider costs return here: GAC over SAC-asym is {value}.",
+    "unknown": "Whether a guider adds to such critics can't be told: GAC over SAC-asym is {value}.",
+}
+
+
+def _sentence(found: Worth, one: Difference, texts: Mapping[str, str]) -> str:
+    return texts[one.verdict(NEGLIGIBLE * found.span)].format(value=in_words(found, one))
+
+
+def in_words(found: Worth, one: Difference) -> str:
+    """
+    :param found: of runs
+    :param one: of their differences
+    :return: such as "310 (120 to 500 with 95% confidence; 12% of what was learned)"
+    """
+    if math.isinf(one.low):
+        return f"{number(one.value)} (of one seed each, which can't tell it from chance)"
+    part = f"; {one.value / found.span:.0%} of what was learned" if found.span > 0 else ""
+    return f"{number(one.value)} ({number(one.low)} to {number(one.high)} with {CONFIDENCE:.0%} confidence{part})"
+
+
+def number(value: float) -> str:
+    """
+    :param value: a return, or a difference of returns
+    :return: with three digits, or all of them before the point
+    """
+    if value == 0 or abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
+
+
+def recommendation(found: Worth, steps: int) -> list[str]:
+    """
+    :param found: of runs
+    :param steps: of each run
+    :return: sentences: what to train with, how sure that is, and what to do next
+    """
+    if not found.learned:
+        return [
+            f"No algorithm ends above random actions, which return {number(found.random[0])}: nothing was learned in "
+            f"{steps:,} steps, so these runs say nothing about privileged information. Give more --steps, or try another --preset.",
+        ]
+    return [*_choice(found), *_next_steps(found)]
+
+
+def _choice(found: Worth) -> Sequence[str]:
+    names = found.deployable
+    if not names:
+        return ["None of these algorithms can be deployed without the privileged entries."]
+    best = max(names, key=lambda name: float(found.ends[name].mean()))
+    behind = {name: difference(found.ends, best, name) for name in names if name != best}
+    tied = [name for name in names if name == best or behind[name].verdict(NEGLIGIBLE * found.span) in ("same", "unknown")]
+    chosen = tied[0]
+    text = f"Train with {title(chosen)}."
+    if tied == [best] and len(names) > 1:
+        return [text, f"It ends above {listed([title(name) for name in names if name != best])}, beyond chance."]
+    if len(tied) > 1:
+        others = listed([title(name) for name in tied[1:]])
+        sure = all(difference(found.ends, name, chosen).verdict(NEGLIGIBLE * found.span) == "same" for name in tied[1:])
+        why = "come equally far" if sure else "can't be told from it with these seeds"
+        return [text, f"It is the simplest of those that do best: {others} {why}."]
+    return [text]
+
+
+def _next_steps(found: Worth) -> Sequence[str]:
+    least = min(len(end) for end in found.ends.values())
+    needed = seeds_to_see(found)
+    unknown = any(
+        one is not None and one.verdict(NEGLIGIBLE * found.span) == "unknown"
+        for one in (found.headroom, found.in_training, found.guider)
+    )
+    hints = []
+    if unknown:
+        size = f"a difference of {WORTH_SEEING:.0%} of what was learned"
+        if needed > least:
+            hints.append(
+                f"What can't be told is a matter of seeds: {needed} would show {size}, {least} can't be relied upon to."
+            )
+        else:
+            hints.append(f"What can't be told is small: {least} seeds would most likely have shown {size}.")
+    if found.headroom is not None and found.headroom.verdict(NEGLIGIBLE * found.span) == "more":
+        hints.append(
+            "Since there is headroom, try what shows the policy more: the History wrapper, a recurrent policy, another sensor."
+        )
+    return hints
+
+
+def title(algorithm: str) -> str:
+    """
+    :param algorithm: its name
+    :return: what it is called in sentences
+    """
+    return TITLES.get(algorithm, algorithm)
+
+
+def listed(names: Sequence[str]) -> str:
+    """
+    :param names: at least one
+    :return: as in "a, b and c"
+    """
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
