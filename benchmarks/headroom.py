@@ -231,7 +231,7 @@ def recommendation(found: Worth, steps: int) -> list[str]:
     if not found.learned:
         return [
             f"No algorithm ends above random actions, which return {number(found.random[0])}: nothing was learned in "
-            f"{steps:,} steps, so these runs say nothing about privileged information. Give more --steps, or try another --preset.",
+            f"{steps:,} steps, so these runs say nothing about privileged information. Give more --steps, or another --preset.",
         ]
     return [*_choice(found), *_next_steps(found)]
 
