@@ -48,7 +48,12 @@ def parse_arguments(description: str | None, arguments: Sequence[str] | None = N
     )
     parser.add_argument("--env-kwargs", type=_mapping, default={}, metavar="YAML", help='such as "{noise_std: 0.1}"')
     parser.add_argument(
-        "--wrappers", nargs="+", default=[], metavar="MODULE:CLASS", help="around it, from the inside to the outside"
+        "--wrappers",
+        nargs="+",
+        type=_yaml,
+        default=[],
+        metavar="MODULE:CLASS",
+        help='around it, from the inside to the outside; with arguments as in "sb3_gac.envs:History: {length: 4}"',
     )
     parser.add_argument(
         "--whole-state",
@@ -79,11 +84,15 @@ def _positive(text: str) -> int:
     return value
 
 
-def _mapping(text: str) -> dict[str, Any]:
+def _yaml(text: str) -> Any:
     try:
-        found = yaml.safe_load(text)
+        return yaml.safe_load(text)
     except yaml.YAMLError as error:
-        raise argparse.ArgumentTypeError(f"is no YAML: {error}") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is no YAML: {error}") from None
+
+
+def _mapping(text: str) -> dict[str, Any]:
+    found = _yaml(text)
     if not isinstance(found, Mapping):
         raise argparse.ArgumentTypeError(f'must be a mapping, such as "{{key: 0.1}}", got {text!r}')
     return dict(found)
@@ -153,7 +162,7 @@ def command(options: argparse.Namespace) -> str:
     given = {
         "--env": [options.env],
         "--env-kwargs": [_flow(options.env_kwargs)] if options.env_kwargs else [],
-        "--wrappers": options.wrappers,
+        "--wrappers": [wrapper if isinstance(wrapper, str) else _flow(wrapper) for wrapper in options.wrappers],
         "--algorithms": options.algorithms if tuple(options.algorithms) != ALGORITHMS else [],
         "--seeds": [options.seeds],
         "--steps": [options.steps],

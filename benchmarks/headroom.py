@@ -4,6 +4,7 @@ training, or never, with intervals that hold for few seeds, and what follows fro
 """
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -98,7 +99,9 @@ def difference(scores: Mapping[str, np.ndarray], better: str, other: str) -> Dif
         return Difference(better, other, value, -math.inf, math.inf)
     if one.std() == two.std() == 0:
         return Difference(better, other, value, value, value)
-    low, high = stats.ttest_ind(one, two, equal_var=False).confidence_interval(CONFIDENCE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # that one of the two does not vary is no loss of precision
+        low, high = stats.ttest_ind(one, two, equal_var=False).confidence_interval(CONFIDENCE)
     return Difference(better, other, value, float(low), float(high))
 
 
@@ -231,7 +234,8 @@ def recommendation(found: Worth, steps: int) -> list[str]:
     if not found.learned:
         return [
             f"No algorithm ends above random actions, which return {number(found.random[0])}: nothing was learned in "
-            f"{steps:,} steps, so these runs say nothing about privileged information. Give more --steps, or another --preset.",
+            f"{steps:,} steps, and these runs say nothing about privileged information.",
+            "Give more --steps, or another --preset.",
         ]
     return [*_choice(found), *_next_steps(found)]
 
@@ -250,7 +254,8 @@ def _choice(found: Worth) -> Sequence[str]:
     if len(tied) > 1:
         others = listed([title(name) for name in tied[1:]])
         sure = all(difference(found.ends, name, chosen).verdict(NEGLIGIBLE * found.span) == "same" for name in tied[1:])
-        why = "come equally far" if sure else "can't be told from it with these seeds"
+        comes = "comes" if len(tied) == 2 else "come"
+        why = f"{comes} equally far" if sure else "can't be told from it with these seeds"
         return [text, f"It is the simplest of those that do best: {others} {why}."]
     return [text]
 

@@ -71,8 +71,8 @@ def test_the_page_draws_seeds_band_mean_and_guider():
     figure = interactive(_tidy(["sac"]))
     assert "sac, guider" not in [line.name for line in figure.data]
     band, *_ = [line for line in figure.data if line.fill == "toself"]
-    error = 1.96 * 1000 * 0.5**0.5 / 2**0.5
-    assert list(band.y) == pytest.approx([1500 + error, 3000 + 2 * error, 3000 - 2 * error, 1500 - error])
+    error = 12.7062 * 1000 * 0.5**0.5 / 2**0.5  # Student's t, one degree of freedom
+    assert list(band.y) == pytest.approx([1500 + error, 3000 + 2 * error, 3000 - 2 * error, 1500 - error], rel=1e-4)
     assert [line.name for line in figure.data if line.showlegend] == ["sac"], "once for all cells"
     figure = interactive(pd.concat([_tidy(["gac", "gac-gru"], guider=True), _tidy(["sac"])]))
     named = [(line.name, line.line.dash) for line in figure.data if line.showlegend]

@@ -1,0 +1,197 @@
+"""``python -m sb3_gac.compare``: options become a suite, runs are made once, and the page says what follows."""
+
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from benchmarks import comparison, launch
+from benchmarks.comparison import command, main, parse_arguments, suite_of_options
+from benchmarks.run import run
+from benchmarks.suite import read_suite
+
+SPLIT = "sb3_gac.envs:SplitObservation: {partial: [0, 1], privileged: [2]}"
+SMALL = "{learning_starts: 20, batch_size: 4, gradient_steps: 1, policy_kwargs: {net_arch: [4]}}"
+SHORT = [
+    "--env",
+    "Pendulum-v1",
+    "--wrappers",
+    SPLIT,
+    "--steps",
+    "60",
+    "--eval-episodes",
+    "1",
+    "--overrides",
+    SMALL,
+    "--jobs",
+    "1",
+]
+MODULE = """
+import gymnasium
+
+
+def make_env(torque=2.0):
+    env = gymnasium.make("Pendulum-v1")
+    env.unwrapped.max_torque = torque
+    return env
+"""
+
+
+class InProcess:
+    """An engine that makes runs here, and counts them."""
+
+    cpus = 1
+
+    def __init__(self):
+        self.made = 0
+
+    def run(self, command, log):
+        options = dict(zip(command[3::2], command[4::2], strict=True))
+        run(read_suite(Path(options["--suite"]))[int(options["--index"])], Path(options["--runs"]))
+        self.made += 1
+        return 0
+
+
+@pytest.fixture
+def engine(monkeypatch, tmp_path):
+    engine = InProcess()
+    monkeypatch.setattr(launch, "LocalEngine", lambda: engine)
+    monkeypatch.setattr("benchmarks.aggregate.BOOTSTRAPS", 10)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", "")
+    return engine
+
+
+def _compare(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["compare", *map(str, arguments)])
+    main("What it is for")
+
+
+def _suite(*arguments):
+    return suite_of_options(parse_arguments(None, [*map(str, arguments)]))
+
+
+def test_a_comparison_from_its_command_to_its_page(engine, monkeypatch, tmp_path, capsys):
+    _compare(monkeypatch, *SHORT, "--seeds", 1)
+    assert engine.made == 4
+    out = capsys.readouterr().out
+    page = tmp_path / "comparisons" / "Pendulum-v1" / "index.html"
+    assert out.endswith(f"Page: {page}\n")
+    text = page.read_text()
+    for name in (
+        "SAC on the full state",
+        "SAC-asym",
+        "GAC",
+        "SAC on partial alone",
+        "random actions",
+        "Headroom over training",
+    ):
+        assert name in text
+    assert "python -m sb3_gac.compare --env Pendulum-v1" in text
+    _compare(monkeypatch, *SHORT, "--seeds", 2, "--algorithms", "sac")
+    assert engine.made == 5, "the first seed is there already"
+    _compare(monkeypatch, *SHORT, "--seeds", 2, "--algorithms", "sac")
+    assert engine.made == 5
+
+
+def test_the_command_on_the_page_is_the_same_comparison():
+    given = [
+        "--env",
+        "m:make",
+        "--env-kwargs",
+        "{noise: 0.2, kind: a b}",
+        "--wrappers",
+        SPLIT,
+        "m:Other",
+        "--seeds",
+        "3",
+        "--whole-state",
+    ]
+    given += ["--steps", "900", "--algorithms", "sac-asym", "gac", "--preset", "sb3", "--overrides", "{gamma: 0.9}"]
+    options = parse_arguments(None, given)
+    again = parse_arguments(None, shlex.split(command(options))[3:])
+    assert vars(again) == vars(options)
+
+
+def test_critics_see_every_entry_unless_privileged_is_the_whole_state():
+    assert _suite("--env", "m:make")["overrides"]["role_keys"] is None
+    assert "role_keys" not in _suite("--env", "m:make", "--whole-state")["overrides"]
+    assert "role_keys" not in _suite("--env", "sb3_gac/Hopper-v5")["overrides"], "whose preset knows"
+
+
+def test_a_registered_task_has_its_own_settings():
+    (cell,) = _suite("--env", "sb3_gac/Hopper-v5", "--env-kwargs", "{noise_std: 0.3, history: 4}")["cells"]
+    assert (cell["task"], cell["noises"], cell["history"]) == ("Hopper", [0.3], 4)
+    suite = _suite("--env", "sb3_gac/HopperPixels-v5")
+    assert (suite["preset"], suite["cells"][0]["noises"]) == ("pixels", [0.0])
+    (cell,) = _suite("--env", "sb3_gac/Hopper-v5", "--env-kwargs", "{privileged: velocity}")["cells"]
+    assert cell["env"] == "sb3_gac/Hopper-v5", "with arguments that the task's settings are not for"
+
+
+def test_gradient_steps_are_compiled_where_it_pays(monkeypatch):
+    monkeypatch.setattr(comparison.shutil, "which", lambda name: "/usr/bin/c++")
+    assert _suite("--env", "m:make", "--steps", 10_000)["overrides"]["compile"] is True
+    assert "compile" not in _suite("--env", "m:make", "--steps", 9_000)["overrides"]
+    assert _suite("--env", "m:make", "--overrides", "{compile: false}")["overrides"]["compile"] is False
+    monkeypatch.setattr(comparison.shutil, "which", lambda name: None)
+    assert "compile" not in _suite("--env", "m:make")["overrides"]
+
+
+def test_a_function_that_makes_an_environment(engine, monkeypatch, tmp_path):
+    (tmp_path / "my_own_envs.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    arguments = [word if word != "Pendulum-v1" else "my_own_envs:make_env" for word in SHORT]
+    _compare(monkeypatch, *arguments, "--env-kwargs", "{torque: 1.0}", "--algorithms", "sac", "--seeds", 1)
+    suite = yaml.safe_load((tmp_path / "comparisons" / "make_env" / "suite.yml").read_text())
+    assert suite["cells"][0]["env_kwargs"] == {"torque": 1.0}
+    assert engine.made == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "Pendulum-v1"], "partial"),
+        (["--env", "NoSuchEnvironment-v7"], "NoSuchEnvironment"),
+        (["--env", "no_such_module:make"], "no_such_module"),
+        ([*SHORT, "--overrides", "{gama: 0.9}"], "gama"),
+    ],
+)
+def test_what_is_wrong_is_said_before_the_first_run(engine, monkeypatch, arguments, message):
+    with pytest.raises(SystemExit) as stop:
+        _compare(monkeypatch, *arguments)
+    assert message in str(stop.value)
+    assert engine.made == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seeds", "0"], "must be at least 1"),
+        (["--env-kwargs", "noise"], "must be a mapping"),
+        (["--env-kwargs", "{noise: ["], "is no YAML"),
+        (["--algorithms", "ppo"], "invalid choice: 'ppo'"),
+    ],
+)
+def test_bad_options_are_named(capsys, arguments, message):
+    with pytest.raises(SystemExit):
+        parse_arguments(None, ["--env", "m:make", *arguments])
+    assert message in capsys.readouterr().err
+
+
+def test_a_run_that_fails_is_named_with_its_log(engine, monkeypatch):
+    monkeypatch.setattr(engine, "run", lambda command, log: 1)
+    with pytest.raises(SystemExit) as stop:
+        _compare(monkeypatch, *SHORT, "--seeds", 1, "--algorithms", "sac")
+    assert "1 runs failed" in str(stop.value)
+    assert "seed0/log.txt" in str(stop.value)
+
+
+def test_help_from_anywhere(tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-m", "sb3_gac.compare", "--help"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert "headroom" in result.stdout
+    assert "--whole-state" in result.stdout

@@ -1,0 +1,178 @@
+"""What privileged information is worth: differences and intervals by hand, verdicts, and the sentences that they give."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.headroom import (
+    Difference,
+    difference,
+    findings,
+    headroom_curve,
+    in_words,
+    mean_interval,
+    number,
+    recommendation,
+    seeds_to_see,
+    worth,
+)
+
+RANDOM = np.array([-2.0, 0.0, 2.0, 0.0])
+
+
+def _tidy(ends, steps=(100, 200, 300, 400), start=0.0):
+    """Curves that rise in their last quarter: algorithm -> end of each seed."""
+    return pd.DataFrame(
+        [
+            {"task": "T", "algorithm": name, "seed": seed, "timesteps": step, "learner": end if step == steps[-1] else start}
+            for name, of_seeds in ends.items()
+            for seed, end in enumerate(of_seeds)
+            for step in steps
+        ]
+    )
+
+
+def _worth(**ends):
+    return worth(_tidy({name.replace("_", "-"): values for name, values in ends.items()}), RANDOM)
+
+
+def test_a_difference_by_hand():
+    """Variances 1 and 4, three seeds: standard error sqrt(5 / 3), Welch's degrees of freedom (5/3)^2 / (1/18 + 16/18)."""
+    one, other = np.array([9.0, 10.0, 11.0]), np.array([3.0, 5.0, 7.0])
+    freedom = (5 / 3) ** 2 / ((1 / 3) ** 2 / 2 + (4 / 3) ** 2 / 2)
+    assert freedom == pytest.approx(2.941, abs=1e-3)
+    found = difference({"a": one, "b": other}, "a", "b")
+    half = 3.2187 * math.sqrt(5 / 3)  # the 97.5% point of Student's t with so many degrees of freedom, from a table
+    assert found.value == 5.0
+    assert (found.low, found.high) == pytest.approx((5 - half, 5 + half), abs=0.01)
+
+
+def test_the_interval_of_a_mean_by_hand():
+    mean, low, high = mean_interval(np.array([1.0, 2.0, 3.0]))
+    assert (mean, low, high) == pytest.approx((2.0, 2 - 4.3027 / math.sqrt(3), 2 + 4.3027 / math.sqrt(3)), abs=1e-3)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**31), n_seeds=st.integers(2, 8), shift=st.floats(-1e3, 1e3))
+def test_a_difference_is_antisymmetric_and_does_not_see_a_shift(seed, n_seeds, shift):
+    scores = dict(zip("ab", np.random.RandomState(seed).normal(size=(2, n_seeds)), strict=True))
+    found = difference(scores, "a", "b")
+    back = difference(scores, "b", "a")
+    shifted = difference({name: values + shift for name, values in scores.items()}, "a", "b")
+    assert (back.value, back.low, back.high) == pytest.approx((-found.value, -found.high, -found.low))
+    assert shifted[2:] == pytest.approx(found[2:], abs=1e-6)
+    assert found.low <= found.value <= found.high
+
+
+def test_intervals_hold_for_three_seeds():
+    """Of a hundred repetitions without any difference, about five exclude 0: 1.96 standard errors would exclude it in 16."""
+    numbers = np.random.RandomState(0).normal(size=(500, 2, 3))
+    found = [difference({"a": one, "b": other}, "a", "b") for one, other in numbers]
+    assert 0.01 < np.mean([one.low > 0 or one.high < 0 for one in found]) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [
+        (1, 9, "more"),
+        (-9, -1, "less"),
+        (-1, 9, "unknown"),
+        (-0.4, 0.4, "same"),
+        (0.1, 0.4, "same"),
+        (-math.inf, math.inf, "unknown"),
+    ],
+)
+def test_verdicts(low, high, verdict):
+    assert Difference("a", "b", (low + high) / 2, low, high).verdict(negligible=0.5) == verdict
+
+
+def test_a_run_ends_with_its_last_quarter_and_is_measured_from_random_actions():
+    tidy = _tidy({"sac": [8.0, 10.0]}, steps=tuple(range(8)), start=-4.0)
+    found = worth(tidy, RANDOM)
+    assert found.ends["sac"].tolist() == [2.0, 3.0], "the mean of the last two of eight evaluations"
+    assert found.areas["sac"].tolist() == [(8 - 28) / 8, (10 - 28) / 8]
+    assert found.span == 2.5 - 0.0
+    assert found.headroom is found.in_training is found.guider is None
+
+
+def test_clear_results_are_told():
+    found = _worth(sac_full=[100, 101, 102], sac_asym=[60, 61, 62], gac=[60, 61, 62], sac=[20, 21, 22])
+    headroom, in_training, guider = findings(found)
+    assert headroom.startswith("There is headroom.")
+    assert "40.0 (37.7 to 42.3 with 95% confidence; 40% of what was learned)" in headroom
+    assert in_training.startswith("Privileged information in training alone is worth 40.0")
+    assert guider.startswith("A guider changes nothing")
+    assert recommendation(found, 1000) == [
+        "Train with SAC-asym.",
+        "It is the simplest of those that do best: GAC comes equally far.",
+        "Since there is headroom, try what shows the policy more: the History wrapper, a recurrent policy, another sensor.",
+    ]
+
+
+def test_a_clear_winner_is_recommended():
+    found = _worth(sac_full=[100, 101, 102], sac_asym=[60, 61, 62], gac=[98, 99, 100], sac=[20, 21, 22])
+    assert findings(found)[2].startswith("A guider is worth 38.0")
+    first, second, *_ = recommendation(found, 1000)
+    assert (first, second) == ("Train with GAC.", "It ends above SAC on partial alone and SAC-asym, beyond chance.")
+
+
+def test_harm_is_told():
+    found = _worth(sac_full=[40, 41, 42], sac_asym=[60, 61, 62], gac=[20, 21, 22], sac=[99, 100, 101])
+    headroom, in_training, guider = findings(found)
+    assert headroom.startswith("SAC on the full state ends below SAC-asym, by -20.0")
+    assert in_training.startswith("Critics that see the privileged entries do harm")
+    assert guider.startswith("A guider costs return here: GAC over SAC-asym is -40.0")
+
+
+def test_what_can_not_be_told_is_said_with_the_seeds_that_would_tell():
+    found = _worth(sac_full=[100, 40, 70], sac_asym=[90, 30, 50], gac=[95, 20, 60], sac=[80, 20, 55])
+    assert all("can't be told" in sentence for sentence in findings(found))
+    first, second, third = recommendation(found, 1000)
+    assert first == "Train with SAC on partial alone."
+    assert second.endswith("SAC-asym and GAC can't be told from it with these seeds.")
+    needed = seeds_to_see(found)
+    assert needed > 3
+    assert third.startswith(f"What can't be told is a matter of seeds: {needed} would show a difference of 10%")
+
+
+def test_the_seeds_that_tell_a_difference_by_hand():
+    """Two groups, standard deviation 10, a difference of 10: 2 (1.960 + 0.842)^2 = 15.7."""
+    found = _worth(sac=[90, 110, 100], sac_asym=[90, 110, 100])
+    assert found.span == 100
+    assert seeds_to_see(found) == 16
+
+
+def test_with_one_seed_nothing_is_told():
+    found = _worth(sac_full=[100], sac_asym=[60])
+    (headroom,) = findings(found)
+    assert headroom.endswith("40.0 (of one seed each, which can't tell it from chance).")
+
+
+def test_where_nothing_was_learned_that_is_all_that_is_said():
+    found = _worth(sac_full=[0.1, -0.1], sac_asym=[0.2, -0.2])
+    first, second = recommendation(found, 5000)
+    assert "nothing was learned in 5,000 steps" in first
+    assert second == "Give more --steps, or another --preset."
+
+
+def test_the_headroom_at_each_step():
+    curve = headroom_curve(_tidy({"sac-full": [9.0, 11.0], "sac-asym": [4.0, 4.0]}))
+    assert curve.timesteps.tolist() == [100, 200, 300, 400]
+    assert curve.value.tolist() == [0, 0, 0, 6]
+    assert curve.low.iloc[-1] < 6 < curve.high.iloc[-1]
+    assert headroom_curve(_tidy({"sac": [1.0]})).empty
+
+
+def test_numbers_have_three_digits_or_all_before_the_point():
+    assert [number(value) for value in (12345.6, 123.4, 12.34, 1.234, 0.01234, 0.0, -5.678)] == [
+        "12,346", "123", "12.3", "1.23", "0.0123", "0", "-5.68",
+    ]  # fmt: skip
+
+
+def test_a_difference_in_words_where_nothing_varies():
+    found = _worth(sac=[1.0, 1.0], sac_asym=[2.0, 2.0])
+    assert in_words(found, found.in_training) == "1.00 (1.00 to 1.00 with 95% confidence; 50% of what was learned)"
