@@ -153,7 +153,7 @@ def test_with_one_seed_nothing_is_told():
 
 
 def test_where_nothing_was_learned_that_is_all_that_is_said():
-    found = _worth(sac_full=[0.1, -0.1], sac_asym=[0.2, -0.2])
+    found = _worth(sac_full=[0.3, 0.1], sac_asym=[0.2, -0.2])
     first, second = recommendation(found, 5000)
     assert "nothing was learned in 5,000 steps" in first
     assert second == "Give more --steps, or another --preset."
