@@ -21,13 +21,14 @@ from benchmarks.headroom import (
     recommendation,
     title,
 )
-from benchmarks.report import RETURN, STEPS, STYLE, algorithm_lines, palette
+from benchmarks.report import RETURN, STEPS, STYLE, algorithm_lines, palette, title_of
 
 _STYLE = """
 body {max-width: 60em; margin: 2em auto; padding: 0 1em; line-height: 1.45}
 .verdict {border-left: 4px solid #1f77b4; background: #f2f7fb; padding: .6em 1em; font-size: 1.1em}
 .wide {overflow-x: auto}
-th {text-align: left} td.number {text-align: right; white-space: nowrap} tr.best td {font-weight: bold}
+th {text-align: left} td.number {text-align: right; white-space: nowrap} td.text {min-width: 14em}
+tr.best td {font-weight: bold}
 pre {white-space: pre-wrap; overflow-wrap: anywhere}
 """
 _AXES = {"template": "plotly_white", "height": 430, "margin": {"l": 60, "r": 20, "t": 20, "b": 50}, "hovermode": "x unified"}
@@ -43,12 +44,12 @@ def page(tidy: pd.DataFrame, found: Worth, command: str, results: Path, steps: i
     :param steps: of each run
     :return: HTML that needs nothing else
     """
-    task = html.escape(str(tidy.task.iloc[0]))
+    task = html.escape(title_of(str(tidy.task.iloc[0]), float(tidy.noise.iloc[0])))
     verdict = "".join(f"<p>{html.escape(text)}</p>" for text in recommendation(found, steps))
     told = "".join(f"<li>{html.escape(text)}</li>" for text in findings(found))
     figures = [_curves(tidy, found.random[0])] + ([_headroom(tidy)] if found.headroom is not None else [])
     plots = [
-        figure.to_html(full_html=False, include_plotlyjs=index == 0, config={"responsive": True})
+        figure.to_html(full_html=False, include_plotlyjs=index == 0, config={"responsive": True, "displaylogo": False})
         for index, figure in enumerate(figures)
     ]
     captions = [
@@ -73,6 +74,7 @@ def page(tidy: pd.DataFrame, found: Worth, command: str, results: Path, steps: i
 
 def _curves(tidy: pd.DataFrame, random_return: float) -> graph_objects.Figure:
     figure = graph_objects.Figure()
+    tidy = tidy.assign(algorithm=tidy.algorithm.map(title))
     for algorithm, color in palette(list(tidy.algorithm.unique())).items():
         lines = algorithm_lines(tidy[tidy.algorithm == algorithm], algorithm, color)
         for line in lines:
@@ -123,13 +125,13 @@ def _differences_table(found: Worth) -> str:
         for question, one in questions
         if one is not None
     ]
-    return _table(["what it is worth", "difference at the end", "return"], rows)
+    return _table(["what it is worth", "difference at the end", "return"], rows, "text")
 
 
-def _table(head: Sequence[str], rows: Sequence[tuple[Sequence[str], bool]]) -> str:
+def _table(head: Sequence[str], rows: Sequence[tuple[Sequence[str], bool]], kind: str = "number") -> str:
     def row(tag: str, cells: Sequence[str], best: bool = False) -> str:
-        numeric = ["" if index == 0 or tag == "th" else " class=number" for index in range(len(cells))]
-        inner = "".join(f"<{tag}{kind}>{html.escape(cell)}</{tag}>" for cell, kind in zip(cells, numeric, strict=True))
+        kinds = ["" if index == 0 or tag == "th" else f" class={kind}" for index in range(len(cells))]
+        inner = "".join(f"<{tag}{one}>{html.escape(cell)}</{tag}>" for cell, one in zip(cells, kinds, strict=True))
         return f"<tr{' class=best' if best else ''}>{inner}</tr>"
 
     return f"<table>{row('th', head)}{''.join(row('td', cells, best) for cells, best in rows)}</table>"

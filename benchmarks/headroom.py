@@ -271,9 +271,7 @@ def _next_steps(found: Worth) -> Sequence[str]:
     if unknown:
         size = f"a difference of {WORTH_SEEING:.0%} of what was learned"
         if needed > least:
-            hints.append(
-                f"What can't be told is a matter of seeds: {needed} would show {size}, {least} can't be relied upon to."
-            )
+            hints.append(f"What can't be told is a matter of seeds: {needed} of each algorithm would most likely show {size}.")
         else:
             hints.append(f"What can't be told is small: {least} seeds would most likely have shown {size}.")
     if found.headroom is not None and found.headroom.verdict(NEGLIGIBLE * found.span) == "more":
