@@ -2,7 +2,7 @@
 Train GAC on a task with noisy sensors, then evaluate the learner on its partial observation alone::
 
     python -m sb3_gac.train --task HalfCheetah --noise 0.1 --steps 50000 --seed 0
-    python -m sb3_gac.train --history 4    # the learner sees the last four observations, and the actions between them
+    python -m sb3_gac.train --history 1    # the learner sees the newest observation alone, not the last four
 
 Everything is saved under ``runs/``: the model, the learning curve as a picture, the evaluations and the resolved
 configuration.  A run that was stopped, by Ctrl-C or otherwise, goes on from its last checkpoint, and ends as it would have
@@ -34,6 +34,8 @@ from sb3_gac.envs.suites import SUITES, Suite, env_id_of, suite_of, task_of
 
 EVAL_SEED = 10_000
 EVALUATIONS = 10
+#: Noisy observations that the learner sees: on HalfCheetah worth half as much again in return as the newest alone
+HISTORY = 4
 CONFIGURATION, CHECKPOINTS, RESULTS = "config.yaml", "checkpoints", "results.json"
 
 
@@ -81,7 +83,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--privileged", default="state", choices=["state", "velocity"])
     parser.add_argument(
-        "--history", type=int, default=1, help="noisy observations that the learner sees, with the actions between"
+        "--history",
+        type=int,
+        help=f"observations that the learner sees, with the actions between, by default {HISTORY} where sensors are noisy",
     )
     parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--seed", type=int, default=0)
@@ -102,6 +106,8 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     suite = suite_with(options.task)
     options.noise = suite.noise_std if options.noise is None else options.noise
     options.preset = options.preset or suite.preset
+    if options.history is None:
+        options.history = HISTORY if suite.history and options.noise > 0 else 1
     if options.history != 1 and not suite.history:
         parser.error(f"--history: {options.task} takes none.")
     options.envs = options.envs or PRESETS[options.preset].envs
@@ -126,7 +132,7 @@ def options_of(directory: Path) -> argparse.Namespace:
         raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
     if not checkpoints(directory / CHECKPOINTS):
         raise ValueError(f"--resume {directory}: there is no checkpoint in {directory / CHECKPOINTS}; start the run again.")
-    defaults = vars(parse_arguments([]))
+    defaults = vars(parse_arguments([])) | {"history": 1}  # which runs of earlier versions had
     configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
     options = {name: configuration.get(name, default) for name, default in defaults.items() if name != "resume"}
     return argparse.Namespace(**options | {"runs": Path(options["runs"]), "resume": directory})

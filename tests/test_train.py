@@ -35,12 +35,12 @@ def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_pat
     assert np.isfinite([results["learner"], results["random"]]).all()
     assert len(results["history"]) == 10
     last_lines = summary(directory)
-    assert f"(noise 0.1) for {results['steps']} steps" in last_lines
+    assert f"(noise 0.1, history 4) for {results['steps']} steps" in last_lines
     assert results["steps"] == 2400
     assert f"return {results['learner']:.0f} +- {results['learner_std']:.0f} over 2 episodes" in last_lines
     assert f"same seeds: {results['random']:.0f} +- {results['random_std']:.0f}." in last_lines
     assert f'GAC.load("{directory / "model"}")' in last_lines
-    action, _ = GAC.load(directory / "model").predict({"partial": np.zeros(5, np.float32)}, deterministic=True)
+    action, _ = GAC.load(directory / "model").predict({"partial": np.zeros(4 * 5 + 3, np.float32)}, deterministic=True)
     assert action.shape == (1,)
 
 
@@ -85,6 +85,13 @@ def test_much_noise_has_the_target_kl_of_the_figures():
     assert "target_kl" not in gac_arguments(parse_arguments(["--noise", "0.1"])), "the default"
 
 
+def test_what_the_learner_sees_is_a_history_where_sensors_are_noisy():
+    assert parse_arguments([]).history == 4
+    assert parse_arguments(["--noise", "0"]).history == 1
+    assert parse_arguments(["--history", "2"]).history == 2
+    assert parse_arguments(["--task", "Go1JoystickFlatTerrain"]).history == 1, "which takes none"
+
+
 def test_a_history_is_of_the_run_and_a_run_from_before_there_was_one_goes_on(tmp_path, monkeypatch):
     options = parse_arguments(["--history", "4", "--runs", str(tmp_path), "--task", "Hopper"])
     directory = start(options)
@@ -100,7 +107,7 @@ def test_a_history_is_of_the_run_and_a_run_from_before_there_was_one_goes_on(tmp
     with pytest.raises(KeyboardInterrupt):
         train(options, directory)
     assert seen == [[4 * 5 + 3 * 3] * 2]
-    assert "history" not in start(parse_arguments(["--runs", str(tmp_path)])).name
+    assert "history" not in start(parse_arguments(["--history", "1", "--runs", str(tmp_path)])).name
     (directory / "config.yaml").write_text(
         "".join(line for line in (directory / "config.yaml").read_text().splitlines(True) if not line.startswith("history"))
     )
