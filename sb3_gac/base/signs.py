@@ -50,7 +50,7 @@ def gain_and_error(advantages: th.Tensor, horizon: float, scale: float) -> tuple
     What the guider returns more than the learner, by the performance difference lemma (Kakade & Langford 2002): the
     advantages of its actions over the learner's, by critics of the learner, in states that the guider meets.
 
-    :param advantages: Q(s, guider's action) - Q(s, learner's action) by each critic, shape (N, B)
+    :param advantages: Q(s, guider's action) - Q(s, learner's action) by N critics, shape (N, B)
     :param horizon: steps that returns sum up, 1 / (1 - gamma)
     :param scale: mean \\|Q\\|
     :return: the gain as a share of the scale, and its standard error, of the states drawn and of critics that disagree
@@ -131,7 +131,7 @@ class GuidanceSigns(ReturnComparison):
         return gain_and_error(guider - learner, 1 / (1 - min(self.gamma, 1 - 1e-4)), float(learner.abs().mean()))
 
     def _values(self, batch: Batch, policy: Any) -> th.Tensor:
-        """Of a policy's actions, by each critic, in the states that count, shape (N, B)."""
+        """Of a policy's actions in the states that count, shape (N, B); of discrete ones by the smaller critic, (1, B)."""
         no_noise = th.zeros(batch.actions.shape, device=self.device)
         values, _ = policy.value_and_log_prob(batch.q_at_obs(self.policy.critic), no_noise)
         return values[:, batch.mask > 0] if batch.mask is not None else values
