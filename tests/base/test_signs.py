@@ -110,13 +110,13 @@ def test_a_block_between_that_shows_nothing_starts_anew():
 @pytest.mark.parametrize("effect", [0.0, SMALL_EFFECT])
 def test_noise_alone_rarely_warns(effect):
     """
-    Of 200 trainings of 20 blocks with equal policies below 5% are told of a gap, and of those whose guider is as much better
+    Of 100 trainings of 20 blocks with equal policies below 5% are told of a gap, and of those whose guider is as much better
     as counts below 5% that it adds nothing; while nearly all of the former are told that.
     """
     rng = np.random.default_rng(0)
     told = []
     model = _model()
-    for _ in range(200):
+    for _ in range(100):
         model.start_comparing("guider", "learner", 1000, 20)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
