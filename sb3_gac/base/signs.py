@@ -151,7 +151,7 @@ class GuidanceSigns(ReturnComparison):
         self._judge("nothing by critics", upper < SMALL_GAIN, LOOKS_IN_A_ROW, {"gain": 100 * gain, "upper": 100 * upper})
 
     def _judge_kl(self, metrics: Mapping[str, float]) -> None:
-        if not {"kl", "target_kl"} <= set(metrics):
+        if not {"kl", "target_kl", "kl_coef_loss"} <= set(metrics):  # a fixed coefficient holds KL to no target
             return
         numbers = {"kl": metrics["kl"], "target": metrics["target_kl"]}
         share = metrics["kl"] / metrics["target_kl"]

@@ -147,12 +147,13 @@ def test_a_gain_is_absent_only_where_little_of_it_may_be_left(gain, error, warns
     ("kl", "expected"), [(0.001, "nothing by kl"), (0.021, "too much by kl"), (0.005, None), (0.0199, None)]
 )
 def test_kl_far_from_its_target(kl, expected):
-    model = _model()
+    model, blind = _model(), _model()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(3 * LOOKS_IN_A_ROW):
-            model._judge_kl({"kl": kl - 1e-9, "target_kl": 0.01})
-        model._judge_kl({})
+            model._judge_kl({"kl": kl - 1e-9, "target_kl": 0.01, "kl_coef_loss": 0.0})
+            blind._judge_kl({"kl": kl - 1e-9, "target_kl": 0.01})
+    assert not blind.signs_told, "a fixed coefficient holds KL to no target"
     assert model.signs_told == ([] if expected is None else [expected])
     assert len(caught) == len(model.signs_told)
 
