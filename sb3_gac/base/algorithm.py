@@ -18,7 +18,7 @@ from sb3_gac.base.hooks import EpisodeHooks
 from sb3_gac.base.overrides import algorithm_of
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.resuming import ResumableAlgorithm
-from sb3_gac.base.roles import RoleKeys, resolve_lr_scales, resolve_rnn_types, resolve_role_keys
+from sb3_gac.base.roles import MEMORY, RoleKeys, resolve_lr_scales, resolve_rnn_types, resolve_role_keys
 from sb3_gac.base.strict_predict import DeploymentGuard
 from sb3_gac.base.update import GradientSteps
 from sb3_gac.checks.arguments import (
@@ -108,8 +108,10 @@ class AsymmetricAlgorithm(
     @property
     def is_recurrent(self) -> bool:
         """Whether a network has a memory, so that training takes sequences."""
-        rnn_type = (self.policy_kwargs or {}).get("rnn_type") or self.policy_class.default_rnn_type
-        return any(resolve_rnn_types(self.policy_class.roles, rnn_type).values())
+        roles, options = self.policy_class.roles, {"role_keys": self.role_keys, **(self.policy_kwargs or {})}
+        rnn_type = options.get("rnn_type") or self.policy_class.default_rnn_type
+        role_keys = resolve_role_keys(self.observation_space, roles, options["role_keys"])
+        return any(resolve_rnn_types(roles, rnn_type, role_keys).values())
 
     def _check_can_compile(self, side_effects: bool) -> None:
         if side_effects:
@@ -135,6 +137,8 @@ class AsymmetricAlgorithm(
         check_arguments(self)
         resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
         resolve_lr_scales(self.policy_class.roles, self.lr_scales)
+        if MEMORY in (self.lr_scales or {}) and not self.is_recurrent:
+            raise ValueError(f'lr_scales names "{MEMORY}", but no network has one: leave it out, or choose an rnn_type.')
 
     def _all_policy_kwargs(self) -> dict[str, Any]:
         return {**self._policy_options(), **present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")}

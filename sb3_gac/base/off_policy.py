@@ -77,7 +77,8 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         included, in environments that are made alike and return what they did, which is checked; ``None`` for own data
     :param random_shift: pixels by which gradient steps shift the images that the deployed policy reads, at random and each on
         its own, up to so many in each direction (DrQ's augmentation, there 4); 0 for none
-    :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics
+    :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics, "memory" for the memories of
+        recurrent networks, on top of their networks' own
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
         "critic" stands for all critics: where ``privileged`` is the whole state, spare them the sensor noise with
         ``{"critic": ["privileged"]}``

@@ -16,6 +16,7 @@ from sb3_gac.base.acting import ActingPolicy
 from sb3_gac.base.arguments import ConstructorArguments
 from sb3_gac.base.roles import (
     DEFAULT_NET_ARCH,
+    MEMORY,
     RoleKeys,
     resolve_extractors,
     resolve_lr_scales,
@@ -63,7 +64,8 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
     :param optimizer_class: optimiser of policies and critics
     :param optimizer_kwargs: keyword arguments for it, without the learning rate
     :param rnn_type: "gru" or "lstm" for networks that remember, and then take sequences; or role -> one of them, "critic"
-        standing for all critics, for a memory where it is needed; by default that of the policy class
+        standing for all critics and "partial" for every network that reads ``partial`` alone, for a memory where it is
+        needed; by default that of the policy class
     :param rnn_hidden_size: of recurrent networks: size of the recurrent layer, which comes after ``net_arch``
     :param rnn_net_arch: of recurrent networks: hidden layer sizes after the recurrent layer
     """
@@ -124,7 +126,7 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
         self.role_keys = self.complete_role_keys(resolve_role_keys(observation_space, self.roles, role_keys))
         self._role_net_arch = resolve_net_arch(self.roles, self.net_arch)
         self._role_extractors = resolve_extractors(self.roles, features_extractor_class)
-        self.rnn_types = resolve_rnn_types(self.roles, rnn_type or self.default_rnn_type)
+        self.rnn_types = resolve_rnn_types(self.roles, rnn_type or self.default_rnn_type, self.role_keys)
         seen = {key for role in self.roles.policies for key in self.role_keys[role]}
         self._acting_reader = ObservationReader(
             role_space(observation_space, [key for key in observation_space if key in seen])
@@ -306,7 +308,13 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
             own = [parameter for parameter in network.parameters() if owners[id(parameter)] == role]
             group = {"params": own, "lr_scale": lr_scales[role]}
             network.optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
-            self.trained[role] = TrainedParameters(own, network.optimizer, self.unclipped(role))
+            self.trained[role] = TrainedParameters(own, network.optimizer, self.unclipped(role), self._memory_of(role))
+            self.trained[role].scale_memory(lr_scales[MEMORY])
+
+    def _memory_of(self, role: str) -> list[nn.Parameter]:
+        """Parameters of what a network remembers with."""
+        memory = getattr(getattr(self, role), "memory", None)
+        return [] if memory is None else list(memory.parameters())
 
     def refresh_parameters(self, compiled: bool | None = None) -> None:
         """
@@ -325,7 +333,7 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
             value if not isinstance(value, list) else tuple(value)
             for group in groups
             for name, value in group.items()
-            if name not in ("params", "lr", "initial_lr", "lr_scale")
+            if name not in ("params", "lr", "initial_lr", "lr_scale", "memory_lr_scale")
         )
 
     def freeze_as_saved(self) -> None:
@@ -338,9 +346,10 @@ class AsymmetricPolicy(ConstructorArguments, ActingPolicy):
         :param lr_scales: network -> multiple of the learning rate, in place of those that there were
         """
         self.constructor_options["lr_scales"] = lr_scales
-        for role, scale in resolve_lr_scales(self.roles, lr_scales).items():
-            if role in self.trained:
-                getattr(self, role).optimizer.param_groups[0]["lr_scale"] = scale
+        scales = resolve_lr_scales(self.roles, lr_scales)
+        for role, trained in self.trained.items():
+            trained.optimizer.param_groups[0]["lr_scale"] = scales[role]
+            trained.scale_memory(scales[MEMORY])
 
     @property
     def pairs(self) -> dict[str, tuple[BaseModel, BaseModel]]:

@@ -12,6 +12,7 @@ from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.networks.recurrent import CELLS
 
 CRITICS = "critic"
+MEMORY = "memory"
 DEFAULT_NET_ARCH = (256, 256)
 T = TypeVar("T")
 
@@ -153,14 +154,16 @@ def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> di
     Learning rates per role.
 
     :param roles: of the algorithm
-    :param lr_scales: role, or "critic" for all critics -> multiple of the learning rate, where it is not 1
-    :return: role -> multiple, for all roles
+    :param lr_scales: role, or "critic" for all critics -> multiple of the learning rate, where it is not 1; and "memory" ->
+        multiple of its network's rate, for the memory of every network that has one
+    :return: role -> multiple, for all roles, and that of memories
     :raises ValueError: if a role is unknown or a multiple is not a number above 0
     """
-    lr_scales = _check_roles("lr_scales", roles.all, lr_scales or {})
+    lr_scales = _check_roles("lr_scales", (*roles.all, MEMORY), lr_scales or {})
     for role, scale in lr_scales.items():
         check_positive(f'lr_scales["{role}"]', scale)
-    return dict.fromkeys(roles.all, 1.0) | _for_each_role(roles, lr_scales)
+    of_roles = dict.fromkeys(roles.all, 1.0) | _for_each_role(roles, lr_scales)
+    return of_roles | {MEMORY: lr_scales.get(MEMORY, 1.0)}
 
 
 def resolve_update_every(roles: Roles, policy_delay: int, update_every: Mapping[str, int] | None) -> dict[str, int]:
@@ -179,21 +182,26 @@ def resolve_update_every(roles: Roles, policy_delay: int, update_every: Mapping[
     return dict.fromkeys(roles.all, 1) | dict.fromkeys(roles.policies, policy_delay) | _for_each_role(roles, given)
 
 
-def resolve_rnn_types(roles: Roles, rnn_type: str | Mapping[str, str | None] | None) -> dict[str, str | None]:
+def resolve_rnn_types(
+    roles: Roles, rnn_type: str | Mapping[str, str | None] | None, role_keys: Mapping[str, tuple[str, ...]]
+) -> dict[str, str | None]:
     """
     Which networks remember.
 
     :param roles: of the algorithm
-    :param rnn_type: "gru", "lstm" or ``None`` for all roles, or role, or "critic" for all critics -> one of them
+    :param rnn_type: "gru", "lstm" or ``None`` for all roles, or role, or "critic" for all critics -> one of them; and
+        "partial" -> that of every network that reads the entry ``partial`` alone and is not named otherwise
+    :param role_keys: role -> entries, for all networks
     :return: role -> type, ``None`` for a network without a memory, for all networks
     :raises ValueError: if a role or a type is unknown
     """
     by_role = rnn_type if isinstance(rnn_type, Mapping) else dict.fromkeys(roles.networks, rnn_type)
-    given = _check_roles("rnn_type", roles.networks, by_role)
+    given = _check_roles("rnn_type", (*roles.networks, PARTIAL), by_role)
     for value in given.values():
         if value is not None:
             check_choice("rnn_type", value, CELLS)
-    return dict.fromkeys(roles.networks) | _for_each_role(roles, given)
+    sees_little = [role for role in roles.networks if role_keys[role] == (PARTIAL,)]
+    return dict.fromkeys(roles.networks) | dict.fromkeys(sees_little, given.get(PARTIAL)) | _for_each_role(roles, given)
 
 
 def resolve_extractors(

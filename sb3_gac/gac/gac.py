@@ -13,9 +13,9 @@ from typing_extensions import Unpack
 
 from sb3_gac.base.arguments import OffPolicyArguments
 from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
-from sb3_gac.base.comparing import ReturnComparison
 from sb3_gac.base.guider import GuiderPrediction
 from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
+from sb3_gac.base.signs import GuidanceSigns
 from sb3_gac.checks.arguments import ArgumentCheck, PlainSchedule, check_switch, unless
 from sb3_gac.checks.values import check_choice, check_not_negative, check_positive, check_schedule
 from sb3_gac.gac.actors import GUIDERS
@@ -31,8 +31,37 @@ AUTO_TARGET_KL, AUTO_TARGET_KL_BOUNDS, AUTO_TARGET_KL_FACTOR = 0.0033, (1e-4, 0.
 #: Environment steps between two comparisons of the policies' returns, and episodes of each that are compared
 COMPARE_EVERY, COMPARED_EPISODES = 1_000, 20
 
+#: See :class:`sb3_gac.base.signs.GuidanceSigns`
+REMEDIES = {
+    "nothing by returns": (
+        "the guider's own episodes return {guider:.5g} and the learner's {learner:.5g}, a difference of {low:.2f} to "
+        "{high:.2f} standard deviations: guidance adds nothing. Raise target_kl, so that the guider may go further, give "
+        "the learner more of the episodes by behaviour, or use AsymmetricSAC, which takes half of the arithmetic."
+    ),
+    "nothing by critics": (
+        "the guider's actions gain {gain:.2g}% over the learner's, by the learner's critics, and {upper:.2g}% at most: "
+        "guidance adds nothing. Raise target_kl, so that the guider may go further, or use AsymmetricSAC, which takes "
+        "half of the arithmetic."
+    ),
+    "nothing by kl": (
+        "KL(guider || learner) is {kl:.2g}, a tenth of the {target:.2g} that target_kl allows or less: the guider wants "
+        "nothing that the learner does not do. Another target_kl changes nothing; see whether the privileged entry tells "
+        "what the learner can't see, or use AsymmetricSAC, which takes half of the arithmetic."
+    ),
+    "too much by returns": (
+        "the guider's own episodes return {guider:.5g} and the learner's {learner:.5g}, a difference of {low:.2f} to "
+        "{high:.2f} standard deviations: the guider does what the learner can't (imitation gap). Lower target_kl, give "
+        "the learner more of the episodes by behaviour, pull it by guidance, or let it see more (a history, a memory)."
+    ),
+    "too much by kl": (
+        "KL(guider || learner) is {kl:.2g} where target_kl is {target:.2g}: the guider leaves the learner behind "
+        '(imitation gap). Use guider="residual", set a hard bound by max_kl, widen kl_coef_bounds, or raise '
+        "kl_coef_learning_rate."
+    ),
+}
 
-class GAC(ReturnComparison, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[override]
+
+class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[override]
     """
     Guided Actor-Critic: a guider that sees everything collects the data, a learner that sees ``partial`` alone is
     pulled towards it by a KL constraint and by critics of its own. ``predict`` is the learner.
@@ -81,6 +110,7 @@ class GAC(ReturnComparison, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # 
         "learner_entropy": check_switch,
     }
     renamed_arguments: ClassVar[Mapping[str, str]] = {"std_of": "shared_std"}
+    remedies = REMEDIES
     compiled_settings = (
         *AsymmetricOffPolicyAlgorithm.compiled_settings,
         "kl_reduction",

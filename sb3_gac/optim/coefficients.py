@@ -13,7 +13,7 @@ import torch.nn.functional as F
 
 from sb3_gac.checks.values import check_range
 from sb3_gac.math.losses import dual_loss
-from sb3_gac.optim.trained import TrainedParameters, adam_step
+from sb3_gac.optim.trained import TrainedParameters
 
 
 class FixedCoefficient:
@@ -194,12 +194,10 @@ class LearnedCoefficient(ABC):
         :param mask: shape (\*E), 1 for valid samples; ``None`` if all are
         :return: loss to log, detached, scalar
         """
-        assert self._trained.adam is not None
-        assert self.optimizer is not None
         with th.no_grad():
             mean = self._mean(violation, mask)
             value, slope = self._value_and_slope(self.parameter)
-            adam_step(self._trained.adam, [-slope * mean], self.optimizer.param_groups[0])
+            self._trained.step([-slope * mean])
             self.parameter.clamp_(*self._parameter_bounds)
         return {f"{self.name}_loss": dual_loss(value, mean)}
 

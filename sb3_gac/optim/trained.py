@@ -6,10 +6,12 @@ that bookkeeping takes as long as the arithmetic.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch as th
 from torch import nn
+
+T = TypeVar("T")
 
 
 class AdamTensors(NamedTuple):
@@ -50,11 +52,19 @@ class TrainedParameters:
     :param parameters: of one network
     :param optimizer: of all of them, in one group; torch's Adam and AdamW take the fast way, if their options allow it
     :param unclipped: how many of the last parameters have no say in the gradient's norm and its bound
+    :param memory: those of the parameters whose learning rate :meth:`scale_memory` multiplies
     """
 
-    def __init__(self, parameters: Sequence[nn.Parameter], optimizer: th.optim.Optimizer, unclipped: int = 0):
+    def __init__(
+        self,
+        parameters: Sequence[nn.Parameter],
+        optimizer: th.optim.Optimizer,
+        unclipped: int = 0,
+        memory: Sequence[nn.Parameter] = (),
+    ):
         self.everything = list(parameters)
         self.optimizer = optimizer
+        self._memory = {id(parameter) for parameter in memory}
         self._clips = [index < len(self.everything) - unclipped for index in range(len(self.everything))]
         self._state: object = None
         self.trained: list[bool] = []
@@ -82,25 +92,54 @@ class TrainedParameters:
                 if not parameter.requires_grad:
                     self.optimizer.state.pop(parameter, None)
                     parameter.grad = None  # or torch's own step would take it
-            self.adam = self._gathered() if _is_plain_adam(self.optimizer) else None
+            self.adam = list(map(self._gathered, self._parts(self.parameters))) if _is_plain_adam(self.optimizer) else None
         if self.adam is not None:
-            self.adam.learning_rate.fill_(group["lr"])
-            if compiled and not self._powers_follow:
-                self.adam.bring_up_powers(group["betas"])
+            for adam, rate in zip(self.adam, self._learning_rates(), strict=True):
+                adam.learning_rate.fill_(rate)
+                if compiled and not self._powers_follow:
+                    adam.bring_up_powers(group["betas"])
             self._powers_follow = self._powers_follow if compiled is None else compiled
         group["trained"] = trained
 
-    def _gathered(self) -> AdamTensors:
-        for parameter in self.parameters:
+    def scale_memory(self, scale: float) -> None:
+        """
+        :param scale: multiple of the learning rate, for the parameters of the memory
+        :raises ValueError: if the optimiser has one learning rate for all
+        """
+        if scale != 1 and self._memory and self.adam is None:
+            raise ValueError(
+                'lr_scales: a learning rate for "memory" goes with torch\'s Adam and AdamW, without amsgrad, foreach or '
+                f"fused=False, but the optimiser is {type(self.optimizer).__name__}: leave it out, or choose another "
+                "optimizer_class."
+            )
+        self.optimizer.param_groups[0]["memory_lr_scale"] = scale
+
+    def _learning_rates(self) -> list[float]:
+        """Of each of :meth:`_parts`."""
+        group = self.optimizer.param_groups[0]
+        return [group["lr"], group["lr"] * group.get("memory_lr_scale", 1.0)][: 2 if self._memory else 1]
+
+    def _parts(self, values: Sequence[T]) -> list[list[T]]:
+        """
+        :param values: one for each trained parameter
+        :return: those of what is no memory and, if there is one, those of the memory
+        """
+        if not self._memory:
+            return [list(values)]
+        remembers = [id(parameter) in self._memory for parameter in self.parameters]
+        return [[v for v, own in zip(values, remembers, strict=True) if own is part] for part in (False, True)]
+
+    def _gathered(self, parameters: list[nn.Parameter]) -> AdamTensors:
+        for parameter in parameters:
             state = self.optimizer.state[parameter]
             if not state:
                 state["step"] = th.zeros((), device=parameter.device)
                 state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(parameter), th.zeros_like(parameter)
-        states = [self.optimizer.state[parameter] for parameter in self.parameters]
+        states = [self.optimizer.state[parameter] for parameter in parameters]
         means, squares, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
         learning_rate = th.zeros((), device=self.everything[0].device if self.everything else None)
         powers = [step.clone() for step in steps], [step.clone() for step in steps]
-        adam = AdamTensors(list(self.parameters), means, squares, steps, learning_rate, powers)
+        adam = AdamTensors(list(parameters), means, squares, steps, learning_rate, powers)
         adam.bring_up_powers(self.optimizer.param_groups[0]["betas"])
         return adam
 
@@ -158,7 +197,9 @@ class TrainedParameters:
             gradients = [next(scaled) if clips else g for g, clips in zip(gradients, self.clipped, strict=True)]
         with th.no_grad():
             if self.adam is not None:
-                adam_step(self.adam, gradients, self.optimizer.param_groups[0])
+                for adam, own, rate in zip(self.adam, self._parts(gradients), self._learning_rates(), strict=True):
+                    if own:
+                        adam_step(adam, own, {**self.optimizer.param_groups[0], "lr": rate})
             else:
                 for parameter, gradient in zip(self.parameters, gradients, strict=True):
                     parameter.grad = gradient

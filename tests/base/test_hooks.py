@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, RMA, TGRL, AsymmetricSAC
+from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricSAC
 from tests.helpers import Recall, Sampled, TwoViewBandit, small_model
 
 
@@ -197,6 +197,11 @@ def test_a_network_that_rests_is_logged_nevertheless():
         ({"update_every": 2}, "update_every must be a dict of networks or None"),
         ({"policy_kwargs": {"rnn_type": {"critics": "gru"}}}, "rnn_type names unknown roles"),
         ({"policy_kwargs": {"rnn_type": "rnn"}}, "rnn_type must be one of"),
+        ({"lr_scales": {"memory": 0.1}}, 'lr_scales names "memory", but no network has one'),
+        (
+            {"lr_scales": {"memory": 0.1}, "policy_kwargs": {"rnn_type": "gru", "optimizer_class": th.optim.SGD}},
+            'a learning rate for "memory" goes with torch',
+        ),
         ({"policy_kwargs": {"features_extractor_class": {"lerner": None}}}, "features_extractor_class names unknown roles"),
     ],
 )
@@ -242,6 +247,44 @@ def test_a_memory_for_the_learner_alone_stays_with_it_through_a_file(tmp_path):
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], action)
     assert state[0].shape == (4, 8)
     assert loaded.learn(20, reset_num_timesteps=False).num_timesteps == 80
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "arguments", "remember"),
+    [
+        (GAC, {}, {"learner"}),
+        (AsymmetricSAC, {}, {"actor"}),
+        (AsymmetricSAC, {"role_keys": {"critic": ["partial"]}}, {"actor", "critic"}),
+        (AsymmetricSAC, {"role_keys": {"actor": ["partial", "privileged"]}}, set()),
+        (AsymmetricSAC, {"policy_kwargs": {"role_keys": {"critic": ["partial"]}}}, {"actor", "critic"}),
+        (TGRL, {}, {"actor", "auxiliary"}),
+        (COSIL, {}, {"actor", "critic"}),
+    ],
+)
+def test_who_sees_partial_alone_may_be_given_a_memory(algorithm, arguments, remember):
+    of_policy = {"net_arch": [8], "rnn_type": {"partial": "gru"}, **arguments.get("policy_kwargs", {})}
+    model = small_model(Recall(), algorithm, **(arguments | {"policy_kwargs": of_policy, "batch_size": 4}))
+    assert {role for role in model.policy.roles.all if getattr(model.policy, role).memory is not None} == remember
+    assert model.is_recurrent == bool(remember)
+
+
+def test_a_memory_follows_its_own_learning_rate_after_load(tmp_path):
+    """With a rate of next to nothing it stays where it is, while the rest of its network learns."""
+    options = {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8], "rnn_type": {"partial": "gru"}}
+    model = small_model(Recall(), policy_kwargs=options, batch_size=4, lr_scales={"memory": 1e-12, "learner": 2.0})
+
+    def moved(model):
+        before = {name: p.detach().clone() for name, p in model.policy.learner.named_parameters()}
+        model.learn(60, reset_num_timesteps=False)
+        return {
+            name.split(".")[0] for name, p in model.policy.learner.named_parameters() if (p - before[name]).abs().max() > 1e-6
+        }
+
+    assert "memory" not in (others := moved(model))
+    assert others
+    model.save(tmp_path / "model")
+    assert moved(GAC.load(tmp_path / "model", env=Recall())) == others
+    assert moved(GAC.load(tmp_path / "model", env=Recall(), lr_scales={"memory": 0.5})) == others | {"memory"}
 
 
 def test_encoders_by_role():

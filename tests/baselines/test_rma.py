@@ -528,7 +528,7 @@ def test_two_environments_and_episodes_of_replay_train_as_well():
         ({"replay_buffer_class": DictReplayBuffer}, "replay_buffer_class=DictReplayBuffer can't sample what came before"),
         ({"role_keys": {"actor": FULL}}, "RMA encodes entries that its actor does not read, but there are none"),
         ({"role_keys": {"adaptation": ["partial"]}}, r"role_keys names unknown roles \['adaptation'\]"),
-        ({"lr_scales": {"encoder": 2.0}}, r"the roles are \['actor', 'expert', 'critic', 'adaptation'\]"),
+        ({"lr_scales": {"encoder": 2.0}}, r"the roles are \['actor', 'expert', 'critic', 'adaptation', 'memory'\]"),
         ({"policy": "MultiInputGruPolicy"}, "policy must be one of"),
     ],
 )

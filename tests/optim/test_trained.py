@@ -62,6 +62,27 @@ def test_a_step_is_that_of_torchs_adam(optimizer_class, options, compiling, monk
     th.testing.assert_close(ours, theirs)
 
 
+@pytest.mark.parametrize("compiling", [False, True])
+def test_a_memory_has_a_learning_rate_of_its_own(compiling, monkeypatch):
+    """As with two groups of torch's own, its rate changed on the way."""
+    ours = _parameters((3, 2), (2,), (4,))
+    theirs = deepcopy(ours)
+    trained = TrainedParameters(ours, th.optim.Adam(ours, lr=0.1, fused=True), memory=[ours[1]])
+    trained.scale_memory(0.25)
+    plain = th.optim.Adam([{"params": [theirs[0], theirs[2]], "lr": 0.1}, {"params": [theirs[1]], "lr": 0.025}])
+    for step in range(4):
+        if step == 2:
+            trained.scale_memory(0.5)
+            plain.param_groups[1]["lr"] = 0.05
+        trained.refresh()
+        with monkeypatch.context() as patch:
+            if compiling:
+                _as_if_compiling(patch)
+            trained.step(_gradients(ours, step), None)
+        _plain_step(plain, theirs, _gradients(theirs, step))
+    th.testing.assert_close(ours, theirs)
+
+
 @pytest.mark.parametrize("scale", [1e-3, 10.0], ids=["small", "large"])
 @pytest.mark.parametrize("unclipped", [0, 1, 3])
 def test_the_norm_of_the_clipped_alone_is_bounded_and_a_small_one_is_left_alone(scale, unclipped):
