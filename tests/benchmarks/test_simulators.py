@@ -1,34 +1,65 @@
 """Speed beside the simulator's own."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks.simulators import main, measure, simulator_step
+from benchmarks.simulators import Overhead, Speed, main, measure, simulator_step
 from sb3_gac.envs import make_vec
 from tests.envs.vector_helpers import Counters
 
-NOW = [0.0]
+NOW, WORKED = [0.0], [0.0]
 
 
 class SlowAdapter(Counters):
-    """Its simulator takes 2 ms, what is around it 1 ms."""
+    """Its simulator takes 2 ms, what is around it 1 ms, during which others have the processor for 9 ms."""
 
     def advance(self, actions):
         NOW[0] += 0.002
+        WORKED[0] += 0.002
         return super().advance(actions)
 
     def step_wait(self):
-        NOW[0] += 0.001
+        NOW[0] += 0.010
+        WORKED[0] += 0.001
         return super().step_wait()
 
 
 def test_overhead_is_the_share_of_what_is_around_the_simulator(monkeypatch):
-    monkeypatch.setattr("benchmarks.simulators.time", SimpleNamespace(perf_counter=lambda: NOW[0]))
+    clocks = SimpleNamespace(perf_counter=lambda: NOW[0], process_time=lambda: WORKED[0])
+    monkeypatch.setattr("benchmarks.simulators.time", clocks)
     env = SlowAdapter(4)
     env.reset()
-    assert measure(env, seconds=0.3) == pytest.approx((4 / 0.003, 4 / 0.002, 0.5))
+    speed = measure(env, seconds=0.3)
+    assert speed[:2] == pytest.approx((4 / 0.012, 4 / 0.002))
+    assert speed.overhead == pytest.approx((0.5, 0.5, 0.5))
+    assert speed.overhead_by_clock == pytest.approx((5.0, 5.0, 5.0))
+    assert speed.pairs == 9
+
+
+def test_the_overheads_spread_is_that_of_the_pairs(monkeypatch):
+    """Pairs whose adapters take 1, 2, 3, 4, 5 ms: half of them from 2 to 4."""
+    now = [0.0]
+    takes = iter([0.001 * (1 + number // 10 % 5) for number in range(100)])  # ten steps fill a turn
+    monkeypatch.setattr("benchmarks.simulators.MIN_PAIRS", 5)
+    monkeypatch.setattr(
+        "benchmarks.simulators.time", SimpleNamespace(perf_counter=lambda: now[0], process_time=lambda: now[0])
+    )
+
+    class Varying(Counters):
+        def advance(self, actions):
+            now[0] += 0.002
+            return super().advance(actions)
+
+        def step_wait(self):
+            now[0] += next(takes)
+            return super().step_wait()
+
+    env = Varying(1)
+    env.reset()
+    assert measure(env, seconds=0.0).overhead == pytest.approx((1.5, 1.0, 2.0))
 
 
 def test_the_innermost_environments_are_stepped_without_their_wrappers():
@@ -52,3 +83,22 @@ def test_the_command_prints_a_line_for_each_number(capsys):
     main(["Pendulum", "--envs", "1", "2", "--seconds", "0.01"])
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("|")[2].strip() for line in lines[2:]] == ["1", "2"]
+
+
+def test_what_a_file_has_of_others_stays(tmp_path, monkeypatch):
+    path = tmp_path / "simulators.json"
+    speeds = iter(
+        [Speed(10.04, 20, Overhead(0.1, 0.05, 0.2), Overhead(0.3, 0.2, 0.4), 9), Speed(1, 2, *[Overhead(0, 0, 0)] * 2, 5)]
+    )
+    monkeypatch.setattr("benchmarks.simulators.measured", lambda *_: next(speeds))
+    for task in ("Pendulum", "Hopper"):
+        main([task, "--envs", "4", "--out", str(path)])
+    environments = json.loads(path.read_text())["environments"]
+    assert list(environments) == ["sb3_gac/Pendulum-v1", "sb3_gac/Hopper-v5"]
+    assert environments["sb3_gac/Pendulum-v1"]["4"] == {
+        "steps_per_second": 10.0,
+        "simulator_alone": 20,
+        "overhead": [0.1, 0.05, 0.2],
+        "overhead_by_clock": [0.3, 0.2, 0.4],
+        "pairs": 9,
+    }
