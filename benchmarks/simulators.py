@@ -3,10 +3,10 @@ Steps per second of registered environments, beside those of the simulator alone
 
     python -m benchmarks.simulators Go1JoystickFlatTerrain HalfCheetah --envs 1 16 128
 
-Both take turns, a few milliseconds each, so that whatever else the machine does slows down both.  The overhead is the median
-over the pairs of turns of how much more processor time the process takes, which waits for no other process; what the clock
-says stands beside it.  "Alone" is EnvPool's own ``step`` for tasks of EnvPool, and otherwise the innermost environments' one
-after the other, without a wrapper.
+All take turns, a few milliseconds each, so that whatever else the machine does slows down all.  An overhead is the median over
+the turns of how much more processor time the process takes, which waits for no other process; what the clock says is there
+too.  "Alone" is EnvPool's own ``step`` for tasks of EnvPool, and otherwise the innermost environments' one after the other,
+without a wrapper.  "In SB3" are those in gymnasium's and SB3's own wrappers and a ``DummyVecEnv``, as without this package.
 """
 
 import argparse
@@ -18,7 +18,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_gac.envs import BatchVecEnv, make_vec
@@ -26,15 +28,16 @@ from sb3_gac.envs.suites import env_id_of
 from sb3_gac.envs.table import in_columns
 
 TURN = 0.02  # seconds
-MIN_PAIRS = 9
+MIN_TURNS = 9
+COLUMNS = ["id", "environments", "steps/s", "in SB3", "alone", "overhead over SB3's", "over the simulator", "by the clock"]
 
 
 class Overhead(NamedTuple):
     """
-    Time per step that is not the simulator's, as a share of the simulator's.
+    Time per step that another way of stepping does not need, as a share of what it needs.
 
-    :param median: over the pairs of turns
-    :param low: a quarter of the pairs is below
+    :param median: over the turns
+    :param low: a quarter of the turns is below
     :param high: a quarter of them is above
     """
 
@@ -51,34 +54,49 @@ class Speed(NamedTuple):
     Of environments side by side.
 
     :param steps_per_second: of all together, with everything that SB3 needs, by the clock
+    :param in_sb3: without this package's wrappers; None for simulators that step a batch, which SB3 has nothing for
     :param alone: the simulator's
-    :param overhead: in processor time of the process, all of its threads together
+    :param overhead: over the simulator alone, in processor time of the process, all of its threads together
     :param overhead_by_clock: the same as the clock has it, which on a busy machine says little
-    :param pairs: of turns that were measured
+    :param overhead_in_sb3: over ``in_sb3``, in processor time
+    :param turns: that were measured
     """
 
     steps_per_second: float
+    in_sb3: float | None
     alone: float
     overhead: Overhead
     overhead_by_clock: Overhead
-    pairs: int
+    overhead_in_sb3: Overhead | None
+    turns: int
 
 
 def measure(env: VecEnv, seconds: float) -> Speed:
     """
     :param env: reset
-    :param seconds: to measure for, or longer, until there are nine pairs of turns
+    :param seconds: to measure for, or longer, until there are nine turns
     """
     actions = np.stack([env.action_space.sample() for _ in range(env.num_envs)])
-    whole, alone = lambda: env.step(actions), simulator_step(env, actions)
-    n_calls = max(1, round(TURN / min(_times(alone, 1)[0] for _ in range(5))))
-    pairs: list[tuple[tuple[float, float], tuple[float, float]]] = []
+    ways = [lambda: env.step(actions), simulator_step(env, actions)]
+    if isinstance(env, DummyVecEnv):
+        plain = _in_sb3(env)
+        ways.append(lambda: plain.step(actions))
+    n_calls = max(1, round(TURN / min(_times(ways[1], 1)[0] for _ in range(5))))
+    turns: list[list[tuple[float, float]]] = []
     end = time.perf_counter() + seconds
-    while len(pairs) < MIN_PAIRS or time.perf_counter() < end:
-        pairs.append((_times(whole, n_calls), _times(alone, n_calls)))
-    by_clock, by_processor = np.array(pairs).T.swapaxes(1, 2)
-    speed, alone_speed = (env.num_envs / np.median(by_clock, axis=0)).tolist()
-    return Speed(speed, alone_speed, _overhead(*by_processor.T), _overhead(*by_clock.T), len(pairs))
+    while len(turns) < MIN_TURNS or time.perf_counter() < end:
+        turns.append([_times(way, n_calls) for way in ways])
+    by_clock, by_processor = np.array(turns).T  # (ways, turns) each
+    whole, alone, *in_sb3 = (env.num_envs / np.median(by_clock, axis=1)).tolist()
+    return Speed(
+        whole,
+        in_sb3[0] if in_sb3 else None,
+        alone,
+        _overhead(by_processor[0], by_processor[1]),
+        _overhead(by_clock[0], by_clock[1]),
+        _overhead(by_processor[0], by_processor[2]) if in_sb3 else None,
+        len(turns),
+    )
 
 
 def _times(call: Callable[[], Any], times: int) -> tuple[float, float]:
@@ -89,8 +107,8 @@ def _times(call: Callable[[], Any], times: int) -> tuple[float, float]:
     return (time.perf_counter() - clock) / times, (time.process_time() - processor) / times
 
 
-def _overhead(of_whole: np.ndarray, of_alone: np.ndarray) -> Overhead:
-    low, median, high = (np.quantile(of_whole / of_alone, [0.25, 0.5, 0.75]) - 1.0).tolist()
+def _overhead(ours: np.ndarray, theirs: np.ndarray) -> Overhead:
+    low, median, high = (np.quantile(ours / theirs, [0.25, 0.5, 0.75]) - 1.0).tolist()
     return Overhead(median, low, high)
 
 
@@ -107,7 +125,7 @@ def simulator_step(env: VecEnv, actions: np.ndarray) -> Callable[[], Any]:
         return (lambda: env.advance(actions)) if pool is None else (lambda: pool.step(in_its_type))
     if not isinstance(env, DummyVecEnv):
         raise ValueError(f"env must be a DummyVecEnv or a BatchVecEnv, got {type(env).__name__}.")
-    innermost = [getattr(one.unwrapped, "simulated", one.unwrapped) for one in env.envs]
+    innermost = _innermost(env)
 
     def step_all() -> None:
         for one, action in zip(innermost, actions, strict=True):
@@ -116,6 +134,23 @@ def simulator_step(env: VecEnv, actions: np.ndarray) -> Callable[[], Any]:
                 one.reset()
 
     return step_all
+
+
+def _innermost(env: DummyVecEnv) -> list[gym.Env]:
+    return [getattr(one.unwrapped, "simulated", one.unwrapped) for one in env.envs]
+
+
+def _in_sb3(env: DummyVecEnv) -> DummyVecEnv:
+    """The same simulators as SB3's ``make_vec_env`` would have them."""
+    limits = [one.spec.max_episode_steps if one.spec else None for one in env.envs]
+
+    def made(one: gym.Env, limit: int | None) -> Callable[[], gym.Env]:
+        checked = gym.wrappers.OrderEnforcing(gym.wrappers.PassiveEnvChecker(one))
+        return lambda: Monitor(checked if limit is None else gym.wrappers.TimeLimit(checked, limit))
+
+    plain = DummyVecEnv([made(one, limit) for one, limit in zip(_innermost(env), limits, strict=True)])
+    plain.reset()
+    return plain
 
 
 def measured(env_id: str, n_envs: int, seconds: float) -> Speed:
@@ -150,26 +185,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
             speed = measured(env_id, n_envs, options.seconds)
             if options.out is not None:
                 _write(options.out, env_id, n_envs, speed)
-            lines.append([env_id, str(n_envs), f"{speed[0]:,.0f}", f"{speed[1]:,.0f}", *map(str, speed[2:4])])
-    print(in_columns(["id", "environments", "steps/s", "simulator alone", "overhead, processor time", "by the clock"], lines))
+            lines.append([env_id, str(n_envs), *_in_words(speed)])
+    print(in_columns(COLUMNS, lines))
+
+
+def _in_words(speed: Speed) -> list[str]:
+    speeds = ["" if one is None else f"{one:,.0f}" for one in speed[:3]]
+    return [*speeds, str(speed.overhead_in_sb3 or ""), str(speed.overhead), f"{speed.overhead_by_clock.median:+.1%}"]
 
 
 def _write(path: Path, env_id: str, n_envs: int, speed: Speed) -> None:
     """Each measurement as soon as it is made."""
     found = json.loads(path.read_text()) if path.exists() else {}
-    one = {
-        "steps_per_second": round(speed.steps_per_second, 1),
-        "simulator_alone": round(speed.alone, 1),
-        "overhead": [round(share, 4) for share in speed.overhead],
-        "overhead_by_clock": [round(share, 4) for share in speed.overhead_by_clock],
-        "pairs": speed.pairs,
-    }
+    one = {name: _rounded(value) for name, value in speed._asdict().items() if value is not None}
     found.setdefault("columns of overheads", ["median", "lower quartile", "upper quartile"])
     found["made with"] = {name: version(name) for name in ("numpy", "gymnasium", "stable_baselines3", "mujoco")} | {
         "cores": os.cpu_count()
     }
     found.setdefault("environments", {}).setdefault(env_id, {})[str(n_envs)] = one
     path.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def _rounded(value: Any) -> Any:
+    return [round(share, 4) for share in value] if isinstance(value, tuple) else round(value, 1)
 
 
 if __name__ == "__main__":
