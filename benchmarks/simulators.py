@@ -14,7 +14,8 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +30,7 @@ from sb3_gac.envs.table import in_columns
 
 TURN = 0.02  # seconds
 MIN_TURNS = 9
+PACKAGES = ("brax", "envpool", "gymnasium", "gymnasium-robotics", "jax", "mujoco", "numpy", "popgym", "stable_baselines3")
 COLUMNS = ["id", "environments", "steps/s", "in SB3", "alone", "overhead over SB3's", "over the simulator", "by the clock"]
 
 
@@ -199,11 +201,17 @@ def _write(path: Path, env_id: str, n_envs: int, speed: Speed) -> None:
     found = json.loads(path.read_text()) if path.exists() else {}
     one = {name: _rounded(value) for name, value in speed._asdict().items() if value is not None}
     found.setdefault("columns of overheads", ["median", "lower quartile", "upper quartile"])
-    found["made with"] = {name: version(name) for name in ("numpy", "gymnasium", "stable_baselines3", "mujoco")} | {
-        "cores": os.cpu_count()
-    }
+    found.setdefault("made with", {}).update(_versions(), cores=os.cpu_count())
     found.setdefault("environments", {}).setdefault(env_id, {})[str(n_envs)] = one
     path.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def _versions() -> dict[str, str]:
+    installed = {}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            installed[name] = version(name)
+    return installed
 
 
 def _rounded(value: Any) -> Any:
