@@ -37,13 +37,14 @@ def test_overhead_is_the_share_of_what_is_around_the_simulator(monkeypatch):
     assert speed.in_sb3 is speed.overhead_in_sb3 is None
     assert speed.overhead == pytest.approx((0.5, 0.5, 0.5))
     assert speed.overhead_by_clock == pytest.approx((5.0, 5.0, 5.0))
-    assert speed.turns == 9
+    assert speed.microseconds == pytest.approx((750, 500))
+    assert speed.turns == 11  # of 28 ms
 
 
 def test_the_overheads_spreadspread_is_that_of_the_turns(monkeypatch):
     """Turns in which the adapter takes 1, 2, 3, 4, 5 ms: half of them from 2 to 4."""
     now = [0.0]
-    takes = iter([0.001 * (1 + number // 10 % 5) for number in range(100)])  # ten steps fill a turn
+    takes = iter([0.001 * (1 + number // 2 % 5) for number in range(100)])  # two steps fill a turn
     monkeypatch.setattr("benchmarks.simulators.MIN_TURNS", 5)
     monkeypatch.setattr(
         "benchmarks.simulators.time", SimpleNamespace(perf_counter=lambda: now[0], process_time=lambda: now[0])
@@ -60,7 +61,9 @@ def test_the_overheads_spreadspread_is_that_of_the_turns(monkeypatch):
 
     env = Varying(1)
     env.reset()
-    assert measure(env, seconds=0.0).overhead == pytest.approx((1.5, 1.0, 2.0))
+    speed = measure(env, seconds=0.0)
+    assert speed.overhead == pytest.approx((1.5, 1.0, 2.0))
+    assert speed.microseconds == pytest.approx((3000, 2000))
 
 
 def test_the_innermost_environments_are_stepped_without_their_wrappers():
@@ -115,8 +118,8 @@ def test_what_a_file_has_of_others_stays(tmp_path, monkeypatch):
     path = tmp_path / "simulators.json"
     speeds = iter(
         [
-            Speed(10.04, None, 20.0, Overhead(0.1, 0.05, 0.2), Overhead(0.3, 0.2, 0.4), None, 9),
-            Speed(1.0, 2.0, 3.0, *[Overhead(0.0, 0.0, 0.0)] * 3, 5),
+            Speed(10.04, None, 20.0, Overhead(0.1, 0.05, 0.2), Overhead(0.3, 0.2, 0.4), None, (99.64, 49.0), 9),
+            Speed(1.0, 2.0, 3.0, *[Overhead(0.0, 0.0, 0.0)] * 3, (1.0, 1.0, 1.0), 5),
         ]
     )
     monkeypatch.setattr("benchmarks.simulators.measured", lambda *_: next(speeds))
@@ -129,5 +132,6 @@ def test_what_a_file_has_of_others_stays(tmp_path, monkeypatch):
         "alone": 20.0,
         "overhead": [0.1, 0.05, 0.2],
         "overhead_by_clock": [0.3, 0.2, 0.4],
+        "microseconds": [99.64, 49.0],
         "turns": 9,
     }
