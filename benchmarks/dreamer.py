@@ -31,7 +31,7 @@ try:
     from sheeprl.utils import fs
     from sheeprl.utils.utils import dotdict
 except ImportError as error:
-    raise ImportError(f'benchmarks.dreamer needs sheeprl ({error}): pip install "sb3_gac[dreamer]".') from None
+    raise ImportError(f'benchmarks.dreamer needs sheeprl ({error}): pip install -e ".[dreamer]" in the clone.') from None
 
 SIZES = ("1M", "12M", "25M", "50M", "100M", "200M", "400M")
 KEY = "partial"

@@ -66,7 +66,7 @@ class RayEngine:
         try:
             import ray
         except ImportError:
-            raise ImportError('--engine ray needs Ray: pip install "sb3_gac[ray]".') from None
+            raise ImportError('--engine ray needs Ray: pip install -e ".[ray]" in the clone.') from None
         path = [str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(path)}}
         ray.init(address, log_to_driver=False, runtime_env=environment, ignore_reinit_error=True)

@@ -19,7 +19,7 @@ try:
     import onnxruntime
 except ImportError as error:
     raise ImportError(
-        'sb3_gac.learner needs onnxruntime: pip install onnxruntime on the robot, "sb3_gac[export]" where models are trained.'
+        'sb3_gac.learner needs onnxruntime: on the robot pip install onnxruntime, in the clone pip install -e ".[export]".'
     ) from error
 
 METADATA_KEY = "sb3_gac"

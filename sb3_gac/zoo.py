@@ -31,7 +31,9 @@ try:
     from rl_zoo3.enjoy import enjoy
     from rl_zoo3.train import train
 except ImportError as error:
-    raise ImportError(f'sb3_gac.zoo needs rl_zoo3, and {error.name} is not there: pip install "sb3_gac[zoo]".') from error
+    raise ImportError(
+        f'sb3_gac.zoo needs rl_zoo3, and {error.name} is not there: pip install -e ".[zoo]" in the clone.'
+    ) from error
 
 PRESET, N_TIMESTEPS = "small", 100_000
 _NET_ARCHS = {"small": [128, 128], "medium": [256, 256], "large": [400, 300]}

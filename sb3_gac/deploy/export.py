@@ -233,7 +233,9 @@ def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
         import onnx
         import onnxruntime  # noqa: F401, with which the file is compared
     except ImportError as error:
-        raise ImportError(f'A file for ONNX needs onnx and onnxruntime: pip install "sb3_gac[export]" ({error}).') from error
+        raise ImportError(
+            f'A file for ONNX needs onnx and onnxruntime ({error}): pip install -e ".[export]" in the clone.'
+        ) from error
 
     remembers = module.memory is not None
     inputs = [*module.keys, *[module.state_name] * remembers]

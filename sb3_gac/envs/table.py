@@ -47,7 +47,7 @@ def rows(matching: str = "") -> Iterator[Row]:
 
 
 def _how_to_install(suite: Suite) -> str:
-    return "by hand, docs/environments.md" if suite.extra is None else f'pip install "sb3_gac[{suite.extra}]"'
+    return "by hand, docs/environments.md" if suite.extra is None else f'pip install -e ".[{suite.extra}]"'
 
 
 def _shapes(env_id: str, suite: Suite, known: Any) -> tuple[str, str, str]:

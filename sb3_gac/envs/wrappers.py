@@ -265,6 +265,7 @@ class PreviousAction(EntryWrapper):
         if not isinstance(env.action_space, (spaces.Box, spaces.Discrete)):
             raise ValueError(f"PreviousAction needs Box or Discrete actions, but the environment has {env.action_space}.")
         self._reward = reward
+        self._first_action = int(env.action_space.start) if isinstance(env.action_space, spaces.Discrete) else None
         dtype = self._entry.dtype
         self._nothing = np.zeros(spaces.flatdim(env.action_space) + reward, dtype=dtype)
         # A policy may hand in actions outside a Box, which many environments clip
@@ -277,12 +278,15 @@ class PreviousAction(EntryWrapper):
         return np.concatenate([value, self._nothing], dtype=self._entry.dtype)
 
     def _next(self, value: np.ndarray, action: Any, reward: Any) -> np.ndarray:
-        if isinstance(self.action_space, spaces.Discrete):
-            taken = np.eye(int(self.action_space.n))[int(action) - int(self.action_space.start)]
+        added = self._nothing.copy()
+        taken = added[:-1] if self._reward else added
+        if self._first_action is None:
+            taken[:] = np.ravel(action)
         else:
-            taken = np.ravel(action)
-        parts = [value, taken, [reward]] if self._reward else [value, taken]
-        return np.concatenate(parts, dtype=self._entry.dtype, casting="unsafe")
+            taken[int(action) - self._first_action] = 1.0
+        if self._reward:
+            added[-1] = reward
+        return np.concatenate([value, added], dtype=self._entry.dtype)
 
 
 def _count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:

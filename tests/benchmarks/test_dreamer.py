@@ -14,7 +14,7 @@ import torch as th
 import yaml
 from gymnasium import spaces
 
-pytest.importorskip("sheeprl", reason='DreamerV3 comes with an extra: pip install "sb3_gac[dreamer]"')
+pytest.importorskip("sheeprl", reason='DreamerV3 comes with an extra: pip install -e ".[dreamer]"')
 
 from benchmarks.dreamer import LearnersView, Player, command_line, in_hydra, make_env
 from benchmarks.external import request_of

@@ -47,9 +47,9 @@ def test_the_table_knows_their_shapes():
 def test_without_brax_it_is_said_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "brax.envs", None)
     monkeypatch.setitem(sys.modules, "brax", None)
-    with pytest.raises(ImportError, match=r'brax-Ant needs brax.*: pip install "sb3_gac\[brax\]"'):
+    with pytest.raises(ImportError, match=r'brax-Ant needs brax.*: pip install -e "\.\[brax\]"'):
         make_brax("Ant")
-    with pytest.raises(ImportError, match=r'pip install "sb3_gac\[brax\]"'):
+    with pytest.raises(ImportError, match=r'pip install -e "\.\[brax\]"'):
         make_vec("sb3_gac/brax-Ant-v0", n_envs=2)
 
 

@@ -189,7 +189,7 @@ GO1, LEAP = "Go1JoystickFlatTerrain", "LeapCubeRotateZAxis"
 
 @pytest.fixture
 def real():
-    return pytest.importorskip("envpool", reason="EnvPool is not installed: pip install sb3_gac[envpool]")
+    return pytest.importorskip("envpool", reason='EnvPool is not installed: pip install -e ".[envpool]"')
 
 
 @pytest.mark.parametrize("task", TASKS)

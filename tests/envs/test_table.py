@@ -26,9 +26,9 @@ def test_every_environment_is_in_it_with_its_shapes(capsys):
 def test_what_is_missing_says_how_to_install_it_and_keeps_the_shapes_that_are_known(monkeypatch):
     monkeypatch.setattr(suites, "find_spec", lambda module: None)
     (robot,) = rows("Go1Getup")
-    assert robot == Row("sb3_gac/Go1Getup-v0", "playground", "42", "91", "12", 'pip install "sb3_gac[envpool]"')
+    assert robot == Row("sb3_gac/Go1Getup-v0", "playground", "42", "91", "12", 'pip install -e ".[envpool]"')
     game = next(rows("popgym-MineSweeperEasy"))
-    assert game[2:] == ("?", "?", "?", 'pip install "sb3_gac[popgym]"')
+    assert game[2:] == ("?", "?", "?", 'pip install -e ".[popgym]"')
     assert next(rows("Ant"))[5] == "yes", "MuJoCo is no extra"
 
 

@@ -16,4 +16,4 @@ def import_extra(module: str, extra: str, environment: str) -> Any:
         return import_module(module)
     except ImportError as error:
         missing = error.name or module
-        raise ImportError(f'{environment} needs {missing}: pip install "sb3_gac[{extra}]".') from error
+        raise ImportError(f'{environment} needs {missing}: pip install -e ".[{extra}]" in the clone of sb3_gac.') from error

@@ -57,7 +57,9 @@ class CardToName(Summary):
     def of(self, observation: Any) -> np.ndarray:
         """See :meth:`Summary.of`."""
         card = self._card()
-        return _one_hot(np.array(4 if card is None else self.game.deck.suits_idx[card]), 5)
+        named = np.zeros(5, dtype=np.float32)
+        named[4 if card is None else self.game.deck.suits_idx[card]] = 1.0
+        return named
 
     @abstractmethod
     def _card(self) -> Any:
