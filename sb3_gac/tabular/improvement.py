@@ -130,7 +130,9 @@ def mpo_objective(
     :return: what the new learner maximises
     """
     old, new = pomdp.by_state(learner), pomdp.by_state(candidate)
-    per_state = (old * np.exp(values / temperature) * np.log(new)).sum(axis=1) - penalty * (old * np.log(old / new)).sum(axis=1)
+    per_state = (old * np.exp(values / temperature) * np.log(new)).sum(axis=1) - penalty * (old * np.log(old / new)).sum(
+        axis=1
+    )
     return float(weights @ per_state)
 
 
