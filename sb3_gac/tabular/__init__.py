@@ -1,4 +1,4 @@
-"""The paper's theory on arrays: guided policy iteration, its relatives, and what its pull is. numpy alone; docs/theory.md has the verdicts."""
+"""The paper's theory on arrays, with numpy alone: guided policy iteration, its relatives, and what its pull is (docs/theory.md)."""
 
 from sb3_gac.tabular.gaussian import ascent, coefficient_for, guider_optimum, pull
 from sb3_gac.tabular.improvement import (

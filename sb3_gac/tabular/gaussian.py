@@ -1,8 +1,8 @@
 """
-What the pull towards a guider is, for Gaussians that share one std and a quadratic critic Q(a) = -1/2 (a - best)' curvature (a - best).
+What the pull towards a guider is, for Gaussians that share one std, and Q(a) = -1/2 (a - best)' curvature (a - best).
 
-At the guider's optimum (eq. 13, without entropy and squashing) the pull of eq. 16 equals the gradient of the guider's critic at the guider's
-actions. A quadratic Q has its mean's gradient as the mean of its gradient, so that all is in closed form.
+At the guider's optimum (eq. 13, without entropy and squashing) the pull of eq. 16 equals the gradient of the guider's critic
+at the guider's actions. With a quadratic critic the gradient's mean is that at the mean, and all is in closed form.
 """
 
 import numpy as np
@@ -48,7 +48,7 @@ def coefficient_for(
     target_kl: float, learner_mean: np.ndarray, std: np.ndarray, curvature: np.ndarray, best: np.ndarray
 ) -> float:
     """
-    :param target_kl: KL(mu || pi) that the guider's optimum is to have, summed over actions; above 0 and below that of ``best``
+    :param target_kl: KL(mu || pi) of the guider's optimum, summed over actions; above 0 and below that of ``best``
     :param learner_mean: shape (A,)
     :param std: of both policies, shape (A,)
     :param curvature: of the guider's critic, shape (A, A)

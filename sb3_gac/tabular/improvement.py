@@ -43,8 +43,8 @@ def learner_by_own_critic(
     """
     Eq. 16, minimised: alpha KL(mu || pi) less what the learner's own critic says of its actions.
 
-    In each observation pi(a) = alpha m(a) / (level - q(a)), with m and q the averages of guider and critic over its states, and a level at
-    which probabilities sum to one. It loses at most alpha: sum pi q >= max q - alpha, whatever the guider does.
+    In each observation pi(a) = alpha m(a) / (level - q(a)), with m and q the averages of guider and critic over its states,
+    and a level at which probabilities sum to one. It loses at most alpha: sum pi q >= max q - alpha, whatever the guider does.
 
     :param pomdp: with S states, O observations and A actions
     :param alpha: weight of the KL, above 0
@@ -97,7 +97,7 @@ def learner_by_likelihood(
     :param learner: the old one, shape (O, A)
     :param values: guided Q, shape (S, A)
     :param weights: of states, shape (S,)
-    :param normalised: whether exp(Q / alpha) is divided by Z(s), as eqs. 7 and 8 do; eq. 10 has lost it on its way through eq. 28
+    :param normalised: whether exp(Q / alpha) is divided by Z(s), as by eqs. 7 and 8; eq. 28 has lost it
     :return: the new learner, shape (O, A)
     """
     gains = np.exp((values - values.max()) / alpha)

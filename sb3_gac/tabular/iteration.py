@@ -49,7 +49,8 @@ def guided_policy_iteration(
     :param alpha: weight of the KL, above 0
     :param learner: the first one, shape (O, A); uniform by default. Actions that it never takes are never learned
     :param step: the learner's: "distillation" (eq. 8), or "own critic" (eq. 16 with the learner's own values)
-    :param weights: of states in the learner's step, shape (S,); by default the new guider's discounted visits, with which eq. 4 can't fall
+    :param weights: of states in the learner's step, shape (S,); by default the new guider's discounted visits, with which
+        eq. 4 can't fall
     :return: the first policies, and those after each iteration
     :raises ValueError: if ``alpha`` is not above 0, or there is no such ``step``
     """

@@ -136,8 +136,9 @@ def tiger_door() -> TabularPOMDP:
     """
     Appendix B: a tiger is behind one of two doors, and only the guider knows behind which.
 
-    States are (left, right) before listening and (left, right) after it; observations are nothing, left and right. Actions open the left door,
-    open the right door, or listen, with the rewards of the paper's Table 1. Opening a door ends the episode; there is no discount.
+    States are (left, right) before listening and (left, right) after it; observations are nothing, left and right. Actions
+    open the left door, open the right door, or listen, with the rewards of the paper's Table 1. An open door ends the
+    episode; there is no discount.
 
     :return: with S = 4, A = 3, O = 3
     """

@@ -63,8 +63,8 @@ def augmented_rewards(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, lea
     """
     Eq. 18 as it is meant: rewards with which guided values are a policy's ordinary ones, under the guider (eq. 19).
 
-    The paper adds the KL, which is subtracted, and takes that of the present state, which eq. 5 does not have: with it, the fixed point is that of
-    eq. 5 less alpha KL of the state. Eq. 19's next action is the guider's, not the learner's.
+    The paper adds the KL, which is subtracted, and takes that of the present state, which eq. 5 does not have: with it, the
+    fixed point is that of eq. 5 less alpha KL of the state. Eq. 19's next action is the guider's, not the learner's.
 
     :param pomdp: with S states, O observations and A actions
     :param alpha: weight of the KL

@@ -55,7 +55,7 @@ def test_and_for_every_target_kl_by_sum_or_by_mean(seed, share):
 @FEW
 @given(SEEDS, st.floats(-1, 2))
 def test_optimum_and_gradients_are_those_of_the_losses(seed, log_alpha):
-    """Eq. 13 and the critic itself, by differences; a quadratic critic's expectation is that at the mean, but for a constant."""
+    """By differences; a quadratic critic's expectation is its value at the mean, but for a constant."""
     learner, std, curvature, best = _case(seed)
     alpha = float(np.exp(log_alpha))
     guider = guider_optimum(alpha, learner, std, curvature, best)

@@ -126,7 +126,7 @@ def test_lemma_3_2_holds_where_the_learner_tells_states_apart(seed, alpha):
 
 
 def test_lemma_3_2_fails_where_states_look_the_same():
-    """A corridor leads to the left room nine times in ten; in the rooms, which look the same, the learner goes for the left one's reward."""
+    """Nine times in ten a corridor leads left; in the rooms, which look the same, the learner goes for the left one's reward."""
     transitions = np.zeros((3, 2, 3))
     transitions[0] = [[0, 0.9, 0.1], [0, 0, 1]]
     rewards = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
@@ -215,13 +215,13 @@ def test_eq_10_is_eqs_7_and_8_with_the_partition_function_that_eq_28_drops(seed,
 def test_eq_17_as_printed_can_only_grow():
     """Its derivative, by differences, on both sides of the target; that of what is meant changes sign."""
     target, step = 0.01, 1e-6
+
+    def slope(loss, kl):
+        return (loss(0.5 + step, kl) - loss(0.5 - step, kl)) / (2 * step)
+
     for kl, meant_to_grow in ((0.001, False), (0.1, True)):
-        as_printed, as_meant = (
-            (loss(0.5 + step) - loss(0.5 - step)) / (2 * step)
-            for loss in (lambda alpha: -alpha * kl - alpha * target, lambda alpha: -alpha * (kl - target))
-        )
-        assert as_printed < 0
-        assert (as_meant < 0) == meant_to_grow
+        assert slope(lambda alpha, kl: -alpha * kl - alpha * target, kl) < 0
+        assert (slope(lambda alpha, kl: -alpha * (kl - target), kl) < 0) == meant_to_grow
 
 
 def test_what_is_no_iteration_is_refused_by_name():
