@@ -1,4 +1,4 @@
-"""The paper's theory on arrays, with numpy alone: guided policy iteration, its relatives, and what its pull is (docs/theory.md)."""
+"""The paper's theory on arrays, with numpy alone: guided policy iteration, its relatives, and what its pull is."""
 
 from sb3_gac.tabular.gaussian import ascent, coefficient_for, guider_optimum, pull
 from sb3_gac.tabular.improvement import (
@@ -10,11 +10,12 @@ from sb3_gac.tabular.improvement import (
     likelihood_objective,
     mpo_objective,
 )
-from sb3_gac.tabular.iteration import OWN_CRITIC, GuidedIterate, guided_policy_iteration, uniform_learner
+from sb3_gac.tabular.iteration import DISTILLATION, OWN_CRITIC, GuidedIterate, guided_policy_iteration, uniform_learner
 from sb3_gac.tabular.pomdp import TabularPOMDP, action_values, expected_return, tiger_door, visits
 from sb3_gac.tabular.values import augmented_rewards, divergence, guided_backup, guided_objective, guided_values
 
 __all__ = [
+    "DISTILLATION",
     "OWN_CRITIC",
     "GuidedIterate",
     "TabularPOMDP",

@@ -126,7 +126,7 @@ def test_lemma_3_2_holds_where_the_learner_tells_states_apart(seed, alpha):
 
 
 def test_lemma_3_2_fails_where_states_look_the_same():
-    """Nine times in ten a corridor leads left; in the rooms, which look the same, the learner goes for the left one's reward."""
+    """A corridor mostly leads left; in the rooms, which look the same, the learner goes for the left one's reward."""
     transitions = np.zeros((3, 2, 3))
     transitions[0] = [[0, 0.9, 0.1], [0, 0, 1]]
     rewards = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
