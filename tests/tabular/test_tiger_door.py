@@ -14,9 +14,12 @@ from sb3_gac.tabular import (
     expected_return,
     guided_objective,
     guided_policy_iteration,
+    guided_values,
+    improved_guider,
     improved_learner,
     learner_by_own_critic,
     tiger_door,
+    uniform_learner,
     visits,
 )
 from tests.tabular.processes import FEW, SEEDS, STATES, random_pair
@@ -133,6 +136,30 @@ def test_eq_16_is_minimised_and_loses_at_most_alpha(seed, alpha, guider_never_ta
     for other in rng.dirichlet(np.ones(3), size=(20, len(new))):
         nearby = 0.99 * new + 0.01 * other
         assert (eq_16(new) <= eq_16(nearby) + 1e-9).all()
+
+
+@pytest.mark.parametrize("alpha", [1.0, 0.1, 0.02, 0.005])
+def test_eq_16_with_the_guiders_critic_does_as_well_on_tiger_door(alpha):
+    """What it needs is an average over doors; whose critic is averaged is all one to a game that ends there."""
+    process = tiger_door()
+    learner = uniform_learner(process)
+    guider = process.by_state(learner)
+    for _ in range(100):
+        values = guided_values(process, alpha, guider, learner)
+        guider = improved_guider(process, alpha, learner, values)
+        learner = learner_by_own_critic(process, alpha, guider, values, visits(process, guider))
+    assert _return(learner) == pytest.approx(_return(_after(alpha, 100, step=OWN_CRITIC).learner), abs=1e-6)
+
+
+@FEW
+@given(SEEDS, st.floats(0.05, 5.0))
+def test_eq_16_in_the_iteration_follows_the_learners_values_not_the_guiders(seed, alpha):
+    process, _, learner, _ = random_pair(seed, aggregated=True)
+    _, before, after = islice(guided_policy_iteration(process, alpha, learner, step=OWN_CRITIC), 3)
+    own = action_values(process, process.by_state(before.learner))
+    expected = learner_by_own_critic(process, alpha, after.guider, own, visits(process, after.guider))
+    np.testing.assert_allclose(after.learner, expected, atol=1e-12)
+    assert np.abs(own - before.values).max() > 1e-9
 
 
 def test_with_little_alpha_the_own_critic_alone_is_followed():
