@@ -17,9 +17,9 @@ class TigerDoor(gym.Env):
     """
     One of two doors pays 1, the other nothing, and either ends the episode.
 
-    Actions are left, right and listen, which costs 0.1 and tells the learner the door, once and for all. ``partial`` is what was
-    heard (left, right, nothing), ``privileged`` the paying door and what was heard, one-hot each. For who does not know the
-    door, to listen first is best, and returns 0.9.
+    Actions are left, right and listen, which costs 0.1 and tells the learner the door, once and for all. ``partial`` is what
+    was heard (left, right, nothing), ``privileged`` the paying door and what was heard, one-hot each. For who does not know
+    the door, to listen first is best, and returns 0.9.
     """
 
     def __init__(self) -> None:
