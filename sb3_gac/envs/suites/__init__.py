@@ -74,6 +74,7 @@ SUITES = {
     "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True, history=True),
     "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True, history=True),
     "pixels": Suite("sb3_gac.envs.suites.pixels", preset="pixels"),
+    "tiger_door": Suite("sb3_gac.envs.suites.tiger_door", noise_std=0.0),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
     "playground": Suite(
         "sb3_gac.envs.suites.playground", sensor_noise=True, extra="envpool", preset="playground", noise_std=0.0
