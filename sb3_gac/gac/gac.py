@@ -39,9 +39,9 @@ REMEDIES = {
         "the learner more of the episodes by behaviour, or use AsymmetricSAC, which takes half of the arithmetic."
     ),
     "nothing by critics": (
-        "the guider's actions gain {gain:.2g}% over the learner's, by the learner's critics, and {upper:.2g}% at most: "
-        "guidance adds nothing. Raise target_kl, so that the guider may go further, or use AsymmetricSAC, which takes "
-        "half of the arithmetic."
+        "the guider's actions gain {gain:.2g} standard deviations of Q over the learner's, by the learner's critics, and "
+        "{upper:.2g} at most: guidance adds nothing. Raise target_kl, so that the guider may go further, or use "
+        "AsymmetricSAC, which takes half of the arithmetic."
     ),
     "nothing by kl": (
         "KL(guider || learner) is {kl:.2g}, a tenth of the {target:.2g} that target_kl allows or less: the guider wants "
