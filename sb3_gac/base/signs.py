@@ -155,9 +155,11 @@ class GuidanceSigns(ReturnComparison):
     def _judge_kl(self, metrics: Mapping[str, float]) -> None:
         if not {"kl", "target_kl", "kl_coef_loss"} <= set(metrics):  # a fixed coefficient holds KL to no target
             return
-        numbers = {"kl": metrics["kl"], "target": metrics["target_kl"]}
+        numbers = {"kl": metrics["kl"], "target": metrics["target_kl"], "coefficient": metrics["kl_coef"]}
         share = metrics["kl"] / metrics["target_kl"]
-        self._judge("nothing by kl", share < LITTLE_KL, LOOKS_IN_A_ROW, numbers)
+        is_free = metrics["kl_coef_on_bound"] > 0.5
+        self._judge("nothing by kl", share < LITTLE_KL and is_free, LOOKS_IN_A_ROW, numbers)
+        self._judge("held back by kl", share < LITTLE_KL and not is_free, LOOKS_IN_A_ROW, numbers)
         self._judge("too much by kl", share > MUCH_KL, LOOKS_IN_A_ROW, numbers)
 
     def _judge(self, cause: str, is_so: bool, patience: int, numbers: Mapping[str, Any]) -> None:
