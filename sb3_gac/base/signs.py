@@ -18,8 +18,8 @@ BLOCK = 40
 BLOCKS_IN_A_ROW = 3
 #: What a guider's episodes must return more than the learner's to count, in standard deviations of a policy's returns
 SMALL_EFFECT = 0.5
-#: What the guider must gain to count by the learner's critics, as a share of the mean \|Q\|
-SMALL_GAIN = 0.02
+#: What the guider must gain to count by the learner's critics, in standard deviations of Q over the states
+SMALL_GAIN = 0.05
 #: KL as a multiple of its target below which the guider does not use its freedom, and above which it is not held
 LITTLE_KL, MUCH_KL = 0.1, 2.0
 #: Looks in a row before a warning by critics or KL, which change slowly
@@ -52,8 +52,8 @@ def gain_and_error(advantages: th.Tensor, horizon: float, scale: float) -> tuple
 
     :param advantages: Q(s, guider's action) - Q(s, learner's action) by N critics, shape (N, B)
     :param horizon: steps that returns sum up, 1 / (1 - gamma)
-    :param scale: mean \\|Q\\|
-    :return: the gain as a share of the scale, and its standard error, of the states drawn and of critics that disagree
+    :param scale: standard deviation of Q over the states, which, other than its mean, no constant in the reward moves
+    :return: the gain in units of the scale, and its standard error, of the states drawn and of critics that disagree
     """
     n_critics, n_states = advantages.shape
     over_states = advantages.mean(dim=0).var(unbiased=False) / n_states
@@ -128,7 +128,9 @@ class GuidanceSigns(ReturnComparison):
         outputs = {role: batch.outputs(getattr(self.policy, role)).now for role in self.policy.roles.policies}
         policies = self.policy.acting_distributions(outputs)
         guider, learner = (self._values(batch, policies[role]) for role in self.block)
-        return gain_and_error(guider - learner, 1 / (1 - min(self.gamma, 1 - 1e-4)), float(learner.abs().mean()))
+        return gain_and_error(
+            guider - learner, 1 / (1 - min(self.gamma, 1 - 1e-4)), float(learner.mean(dim=0).std(unbiased=False))
+        )
 
     def _values(self, batch: Batch, policy: Any) -> th.Tensor:
         """Of a policy's actions in the states that count, shape (N, B); of discrete ones by the smaller critic, (1, B)."""
@@ -148,14 +150,16 @@ class GuidanceSigns(ReturnComparison):
         self.logger.record("guidance/gain", gain)
         self.logger.record("guidance/gain_error", error)
         upper = gain + QUANTILE * error
-        self._judge("nothing by critics", upper < SMALL_GAIN, LOOKS_IN_A_ROW, {"gain": 100 * gain, "upper": 100 * upper})
+        self._judge("nothing by critics", upper < SMALL_GAIN, LOOKS_IN_A_ROW, {"gain": gain, "upper": upper})
 
     def _judge_kl(self, metrics: Mapping[str, float]) -> None:
         if not {"kl", "target_kl", "kl_coef_loss"} <= set(metrics):  # a fixed coefficient holds KL to no target
             return
-        numbers = {"kl": metrics["kl"], "target": metrics["target_kl"]}
+        numbers = {"kl": metrics["kl"], "target": metrics["target_kl"], "coefficient": metrics["kl_coef"]}
         share = metrics["kl"] / metrics["target_kl"]
-        self._judge("nothing by kl", share < LITTLE_KL, LOOKS_IN_A_ROW, numbers)
+        is_free = metrics["kl_coef_on_bound"] > 0.5
+        self._judge("nothing by kl", share < LITTLE_KL and is_free, LOOKS_IN_A_ROW, numbers)
+        self._judge("held back by kl", share < LITTLE_KL and not is_free, LOOKS_IN_A_ROW, numbers)
         self._judge("too much by kl", share > MUCH_KL, LOOKS_IN_A_ROW, numbers)
 
     def _judge(self, cause: str, is_so: bool, patience: int, numbers: Mapping[str, Any]) -> None:

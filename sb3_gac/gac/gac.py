@@ -39,14 +39,19 @@ REMEDIES = {
         "the learner more of the episodes by behaviour, or use AsymmetricSAC, which takes half of the arithmetic."
     ),
     "nothing by critics": (
-        "the guider's actions gain {gain:.2g}% over the learner's, by the learner's critics, and {upper:.2g}% at most: "
-        "guidance adds nothing. Raise target_kl, so that the guider may go further, or use AsymmetricSAC, which takes "
-        "half of the arithmetic."
+        "the guider's actions gain {gain:.2g} standard deviations of Q over the learner's, by the learner's critics, and "
+        "{upper:.2g} at most: guidance adds nothing. Raise target_kl, so that the guider may go further, or use "
+        "AsymmetricSAC, which takes half of the arithmetic."
+    ),
+    "held back by kl": (
+        "KL(guider || learner) is {kl:.2g}, a tenth of the {target:.2g} that target_kl allows or less, since kl_coef is "
+        'still {coefficient:.2g}: the guider adds less than it may. Let kl_coef start lower, as in "auto_0.01", or raise '
+        "kl_coef_learning_rate."
     ),
     "nothing by kl": (
-        "KL(guider || learner) is {kl:.2g}, a tenth of the {target:.2g} that target_kl allows or less: the guider wants "
-        "nothing that the learner does not do. Another target_kl changes nothing; see whether the privileged entry tells "
-        "what the learner can't see, or use AsymmetricSAC, which takes half of the arithmetic."
+        "KL(guider || learner) is {kl:.2g}, a tenth of the {target:.2g} that target_kl allows or less, and kl_coef is on "
+        "its bound: the guider wants nothing that the learner does not do. Another target_kl changes nothing; see whether "
+        "the privileged entry tells what the learner can't see, or use AsymmetricSAC, which takes half of the arithmetic."
     ),
     "too much by returns": (
         "the guider's own episodes return {guider:.5g} and the learner's {learner:.5g}, a difference of {low:.2f} to "

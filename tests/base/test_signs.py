@@ -139,20 +139,28 @@ def test_a_gain_is_absent_only_where_little_of_it_may_be_left(gain, error, warns
         warnings.simplefilter("always")
         for _ in range(3 * LOOKS_IN_A_ROW):
             model._judge_gain(gain, error)
-    assert [str(w.message).split(", ")[-1].startswith("which takes") for w in caught] == [True] * warns
+    assert ["gain" in str(w.message) and "target_kl" in str(w.message) for w in caught] == [True] * warns
     assert model.logger.name_to_value["guidance/gain"] == gain
 
 
 @pytest.mark.parametrize(
-    ("kl", "expected"), [(0.001, "nothing by kl"), (0.021, "too much by kl"), (0.005, None), (0.0199, None)]
+    ("kl", "on_bound", "expected"),
+    [
+        (0.001, 1.0, "nothing by kl"),
+        (0.001, 0.0, "held back by kl"),
+        (0.021, 0.0, "too much by kl"),
+        (0.005, 1.0, None),
+        (0.0199, 1.0, None),
+    ],
 )
-def test_kl_far_from_its_target(kl, expected):
+def test_kl_far_from_its_target(kl, on_bound, expected):
     model, blind = _model(), _model()
+    seen = {"kl": kl - 1e-9, "target_kl": 0.01, "kl_coef": 0.5, "kl_coef_on_bound": on_bound}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(3 * LOOKS_IN_A_ROW):
-            model._judge_kl({"kl": kl - 1e-9, "target_kl": 0.01, "kl_coef_loss": 0.0})
-            blind._judge_kl({"kl": kl - 1e-9, "target_kl": 0.01})
+            model._judge_kl(seen | {"kl_coef_loss": 0.0})
+            blind._judge_kl(seen)
     assert not blind.signs_told, "a fixed coefficient holds KL to no target"
     assert model.signs_told == ([] if expected is None else [expected])
     assert len(caught) == len(model.signs_told)
