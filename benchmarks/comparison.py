@@ -20,8 +20,7 @@ from benchmarks.config import check_programs
 from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.finished import read_tidy
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, findings, recommendation, worth
-from benchmarks.suite import _NAME as NAME
-from benchmarks.suite import RunSpec, check_is, default_name, read_definitions, read_suite
+from benchmarks.suite import NAME, RunSpec, check_is, default_name, read_definitions, read_suite
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 from sb3_gac.presets import PRESETS, read_preset
 from sb3_gac.train import UniformActions

@@ -1,16 +1,25 @@
 """
 What privileged information is worth on a task: differences of returns between algorithms that see it at deployment, in
-training, or never, with intervals that hold for few seeds, and what follows from them in words.
+training, or never, with intervals that hold for few seeds, and what follows from them in words. Of aggregated results::
+
+    python -m benchmarks.headroom benchmarks/results/baselines --reference sac-asym
+
+prints the ends of all runs, how much they vary, and each algorithm's difference from one of them.
 """
 
+import argparse
 import math
 import warnings
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from scipy import stats
+
+from benchmarks.finished import read_tidy
+from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
 #: What algorithms are called in sentences
@@ -123,20 +132,32 @@ def worth(tidy: pd.DataFrame, random_returns: np.ndarray) -> Worth:
     :param random_returns: of episodes with actions at random
     :return: what privileged information is worth on it
     """
-    runs = {
-        key: run.sort_values("timesteps").learner.to_numpy() for key, run in tidy.groupby(["algorithm", "seed"], sort=False)
-    }
-    names = list(dict.fromkeys(name for name, _ in runs))
-
-    def by_algorithm(score: Any) -> dict[str, np.ndarray]:
-        return {name: np.array([score(run) for (owner, _), run in runs.items() if owner == name]) for name in names}
-
-    ends = by_algorithm(lambda run: run[-math.ceil(END * len(run)) :].mean())
+    ends = by_algorithm(tidy, end_of)
     pairs = ((FULL, ASYMMETRIC), (ASYMMETRIC, PARTIAL), (GUIDED, ASYMMETRIC))
     differences = [difference(ends, *pair) if set(pair) <= set(ends) else None for pair in pairs]
     best = max(float(end.mean()) for end in ends.values())
     random = mean_interval(random_returns)
-    return Worth(ends, by_algorithm(np.mean), random, best - random[0], *differences)
+    return Worth(ends, by_algorithm(tidy, np.mean), random, best - random[0], *differences)
+
+
+def end_of(returns: np.ndarray) -> float:
+    """
+    :param returns: of a run's evaluations, in their order
+    :return: the mean of the last quarter
+    """
+    return float(returns[-math.ceil(END * len(returns)) :].mean())
+
+
+def by_algorithm(tidy: pd.DataFrame, score: Callable[[np.ndarray], float]) -> dict[str, np.ndarray]:
+    """
+    :param tidy: see :func:`worth`
+    :param score: of the returns of a run's evaluations
+    :return: algorithm -> its runs' scores
+    """
+    scores: dict[str, list[float]] = {str(name): [] for name in tidy.algorithm.unique()}
+    for (name, _), run in tidy.sort_values("timesteps", kind="stable").groupby(["algorithm", "seed"], sort=False):
+        scores[name].append(score(run.learner.to_numpy()))
+    return {name: np.array(of_seeds) for name, of_seeds in scores.items()}
 
 
 def headroom_curve(tidy: pd.DataFrame) -> pd.DataFrame:
@@ -295,3 +316,39 @@ def listed(names: Sequence[str]) -> str:
     :return: as in "a, b and c"
     """
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
+    """
+    :param tidy: aggregated evaluations of any number of cells
+    :param reference: algorithm that the others' mean ends are compared with
+    :return: a row for each algorithm of each cell: task, noise, algorithm, each seed's end, mean, standard deviation as a
+        share of the mean, and the difference with its interval; empty fields where one is not there
+    """
+    rows = []
+    for (task, noise), cell in tidy.groupby(["task", "noise"], sort=False):
+        ends = by_algorithm(cell, end_of)
+        for name, of_seeds in ends.items():
+            spread = f"{of_seeds.std(ddof=1) / abs(of_seeds.mean()):.0%}" if len(of_seeds) > 1 else ""
+            compared = difference(ends, name, reference)[2:] if reference in ends and name != reference else ()
+            seeds, over = ", ".join(map(number, of_seeds)), ", ".join(map(number, compared))
+            rows.append([str(task), f"{noise:g}", name, seeds, number(float(of_seeds.mean())), spread, over])
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    Command line.
+
+    :param arguments: by default the process's
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", type=Path, help="path of aggregated results, without a suffix")
+    parser.add_argument("--reference", default=ASYMMETRIC, help=f"algorithm to compare with (default: {ASYMMETRIC})")
+    options = parser.parse_args(arguments)
+    head = ["task", "noise", "algorithm", "each seed's end", "mean", "spread", f"over {options.reference}: value, low, high"]
+    print(in_columns(head, ends_table(read_tidy(options.results.with_suffix(".csv")), options.reference)))
+
+
+if __name__ == "__main__":
+    main()

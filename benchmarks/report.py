@@ -19,7 +19,8 @@ import numpy as np
 import pandas as pd
 from plotly import graph_objects
 from plotly.subplots import make_subplots
-from scipy import stats
+
+from benchmarks.headroom import mean_interval
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -44,11 +45,9 @@ def curves(group: pd.DataFrame, column: str = "learner") -> pd.DataFrame:
     :return: indexed by environment steps: mean over seeds, and the ends of its interval of 95% by Student's t, which for
         three seeds is 4.3 standard errors to either side; of a single seed there is none, and the ends are the mean
     """
-    by_step = group.groupby("timesteps")[column]
-    count = by_step.count()
-    error = stats.t.ppf(0.975, count - 1) * by_step.std(ddof=1) / np.sqrt(count)
-    error = error.fillna(0.0)
-    return pd.DataFrame({"mean": by_step.mean(), "low": by_step.mean() - error, "high": by_step.mean() + error})
+    rows = {step: mean_interval(of_seeds.dropna().to_numpy()) for step, of_seeds in group.groupby("timesteps")[column]}
+    found = pd.DataFrame(rows, index=["mean", "low", "high"]).T
+    return found.where(np.isfinite(found), found["mean"], axis=0)
 
 
 def read_tidy(path: Path, own_steps: bool = False) -> pd.DataFrame:

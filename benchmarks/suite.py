@@ -20,7 +20,7 @@ _SUITE_KEYS = {*_COMMON, "overrides", "algorithms", "cells"}
 _SHARED_KEYS = {"algorithms", "seeds", "needs"}
 _TASK_KEYS = {"task", "noises", "history", *_SHARED_KEYS}
 _ENV_KEYS = {"env", "env_kwargs", "wrappers", "name", *_SHARED_KEYS}
-_NAME = re.compile(r"\w[\w.+-]*")
+NAME = re.compile(r"\w[\w.+-]*")
 _WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # other digits may be in quotes for a reason
 
 
@@ -200,7 +200,7 @@ class _Reader:
         if again := sorted(set(self._own) & set(everybodys)):
             raise ValueError(f"{where}: hyperparams/algorithms.yml has {again} already, give yours another name.")
         for algorithm, definition in self._own.items():
-            check_is(where, algorithm, "names of letters, digits and . + -", str, _NAME.fullmatch)
+            check_is(where, algorithm, "names of letters, digits and . + -", str, NAME.fullmatch)
             check_is(f"{where}, {algorithm}", definition, "a mapping", Mapping)
 
     def cells(self) -> list[list[RunSpec]]:
@@ -236,7 +236,7 @@ class _Reader:
         if "env" in cell:
             check_keys(where, cell, _ENV_KEYS, {"env", "algorithms", "seeds"})
             environment, name = read_environment(where, cell), cell.get("name", default_name(cell["env"]))
-            check_is(f"{where}, name", name, "a name of letters, digits and . + -", str, _NAME.fullmatch)
+            check_is(f"{where}, name", name, "a name of letters, digits and . + -", str, NAME.fullmatch)
             return environment, name, [None]
         check_keys(where, cell, _TASK_KEYS, _TASK_KEYS - {"needs", "history"})
         if "history" in cell:

@@ -34,7 +34,7 @@ from sb3_gac.envs.suites import SUITES, Suite, env_id_of, suite_of, task_of
 
 EVAL_SEED = 10_000
 EVALUATIONS = 10
-#: Noisy observations that the learner sees: on HalfCheetah worth half as much again in return as the newest alone
+#: Noisy observations that the learner sees: with four it returned 3766 on HalfCheetah after 50,000 steps, with one 3432
 HISTORY = 4
 CONFIGURATION, CHECKPOINTS, RESULTS = "config.yaml", "checkpoints", "results.json"
 

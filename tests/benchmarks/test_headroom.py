@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 from benchmarks.headroom import (
     Difference,
     difference,
+    ends_table,
     findings,
     headroom_curve,
     in_words,
+    main,
     mean_interval,
     number,
     recommendation,
@@ -178,3 +180,18 @@ def test_numbers_have_three_digits_or_all_before_the_point():
 def test_a_difference_in_words_where_nothing_varies():
     found = _worth(sac=[1.0, 1.0], sac_asym=[2.0, 2.0])
     assert in_words(found, found.in_training) == "1.00 (1.00 to 1.00 with 95% confidence; 50% of what was learned)"
+
+
+def test_the_ends_of_aggregated_results_by_hand():
+    tidy = _tidy({"sac-asym": [9.0, 11.0], "gac": [20.0, 22.0]}).assign(noise=0.1)
+    first, second = ends_table(tidy, "sac-asym")
+    assert first == ["T", "0.1", "sac-asym", "9.00, 11.0", "10.0", "14%", ""]
+    low, high = (11 + sign * 4.3027 * math.sqrt(2) for sign in (-1, 1))  # two degrees of freedom, variances 2 and 2
+    assert second == ["T", "0.1", "gac", "20.0, 22.0", "21.0", "7%", f"11.0, {number(low)}, {number(high)}"]
+
+
+def test_the_command_prints_the_committed_results(capsys):
+    main(["benchmarks/results/baselines", "--reference", "sac"])
+    out = capsys.readouterr().out
+    assert "over sac: value, low, high" in out
+    assert "2,386, 1,939, 2,833" in out, "of SAC-asym at noise 0.1, as docs/results.md has it"
