@@ -11,16 +11,15 @@ from the results that they were aggregated to.  Intervals are stratified bootstr
 import argparse
 import json
 import shlex
-from collections.abc import Callable, Hashable, Sequence
-from itertools import combinations, permutations
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from rliable import library as rly
 from rliable import metrics
 
+from benchmarks.bootstrap import Estimate, estimate, improvements, interval
 from benchmarks.finished import (
     NAMES,
     NEEDED,
@@ -41,10 +40,6 @@ from benchmarks.suite import HERE, RUNS, needed_steps, read_cells
 CELL = ["task", "noise"]
 REFERENCE = "sac-asym"
 STEADY_FROM = 5_000
-BOOTSTRAPS = 2_000
-#: A value, and the ends of its interval
-Estimate = tuple[float, tuple[float, float]]
-Name = TypeVar("Name", bound=Hashable)
 
 
 def finished_runs(
@@ -149,15 +144,6 @@ def steps_before(group: pd.DataFrame) -> int:
     return int(group[NEEDED].max()) if NEEDED in group else 0
 
 
-def interval(scores: np.ndarray) -> list[float]:
-    """
-    :param scores: one per run
-    :return: interquartile mean, and the ends of its interval
-    """
-    point, (low, high) = _estimate({"one": scores[:, None]}, metrics.aggregate_iqm)["one"]
-    return [round(value, 1) for value in (point, low, high)]
-
-
 def steps_to(group: pd.DataFrame, threshold: float) -> int | None:
     """
     :param group: one algorithm in one cell
@@ -226,22 +212,9 @@ def compare(tidy: pd.DataFrame) -> dict[str, Any]:
             "left_out": [name for name in scores.algorithm.unique() if name not in names],
             "cells": _compared_cells(compared),
         },
-        "normalised_iqm": _rounded(_estimate(matrices, metrics.aggregate_iqm)),
-        "probability_of_improvement": _rounded(_improvements(matrices)),
+        "normalised_iqm": _rounded(estimate(matrices, metrics.aggregate_iqm)),
+        "probability_of_improvement": _rounded(improvements(matrices)),
     }
-
-
-def _improvements(matrices: dict[str, np.ndarray]) -> dict[str, Estimate]:
-    """Of each over each other; the second of two is the first's complement, and is not drawn anew."""
-    pairs = {(one, other): (matrices[one], matrices[other]) for one, other in combinations(matrices, 2)}
-    estimates = _estimate(pairs, metrics.probability_of_improvement)
-    estimates |= {(other, one): _complement(estimate) for (one, other), estimate in estimates.items()}
-    return {f"{one} over {other}": estimates[one, other] for one, other in permutations(matrices, 2)}
-
-
-def _complement(estimate: Estimate) -> Estimate:
-    point, (low, high) = estimate
-    return 1 - point, (1 - high, 1 - low)
 
 
 def _runs_by_cell(of_algorithm: pd.DataFrame) -> np.ndarray:
@@ -259,21 +232,6 @@ def _compared_cells(compared: pd.DataFrame) -> list[dict[str, Any]]:
         }
         for key, cell in compared.groupby(CELL)
     ]
-
-
-def _estimate(scores: dict[Name, Any], metric: Callable[..., float]) -> dict[Name, Estimate]:
-    """Point estimate and interval, the same for the same scores: rliable draws from numpy's global generator."""
-    if not scores:
-        return {}
-
-    def as_array(*arguments: np.ndarray) -> np.ndarray:
-        return np.array([metric(*arguments)])
-
-    state = np.random.get_state()
-    np.random.seed(0)
-    points, intervals = rly.get_interval_estimates(scores, as_array, reps=BOOTSTRAPS)
-    np.random.set_state(state)
-    return {name: (float(points[name][0]), (float(intervals[name][0, 0]), float(intervals[name][1, 0]))) for name in scores}
 
 
 def _rounded(estimates: dict[str, Estimate]) -> dict[str, list[float]]:

@@ -9,7 +9,6 @@ prints the ends of all runs, how much they vary, and each algorithm's difference
 
 import argparse
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +18,7 @@ import pandas as pd
 from scipy import stats
 
 from benchmarks.finished import read_tidy
+from benchmarks.intervals import CONFIDENCE, Difference, difference, mean_interval
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
@@ -26,40 +26,12 @@ FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
 TITLES = {FULL: "SAC on the full state", ASYMMETRIC: "SAC-asym", GUIDED: "GAC", PARTIAL: "SAC on partial alone"}
 #: Of what can be deployed, the simpler first: where several come equally far, the first is enough
 SIMPLER_FIRST = (PARTIAL, ASYMMETRIC, GUIDED)
-CONFIDENCE = 0.95
 #: Part of a run's evaluations whose mean is its end: one evaluation of a few episodes says little
 END = 0.25
 #: Part of all that was learned that does not matter
 NEGLIGIBLE = 0.05
 #: ... and the part that the number of seeds is worked out for, to be seen in four of five repetitions
 WORTH_SEEING, _POWER_QUANTILES = 0.1, float(stats.norm.ppf(0.975) + stats.norm.ppf(0.8))
-
-
-class Difference(NamedTuple):
-    """
-    Of two algorithms' mean scores.
-
-    :param better: name of the first
-    :param other: name of the one whose mean is taken off
-    :param value: of the difference
-    :param low: end of its interval by Welch's t test; ``-inf`` with a single seed
-    :param high: the other end
-    """
-
-    better: str
-    other: str
-    value: float
-    low: float
-    high: float
-
-    def verdict(self, negligible: float) -> str:
-        """
-        :param negligible: a difference that does not matter
-        :return: "more", "less", "same", if all of the interval does not matter, or "unknown"
-        """
-        if -negligible < self.low and self.high < negligible:
-            return "same"
-        return "more" if self.low > 0 else "less" if self.high < 0 else "unknown"
 
 
 class Worth(NamedTuple):
@@ -93,37 +65,6 @@ class Worth(NamedTuple):
         """Algorithms that need no privileged entry at deployment, the simpler first."""
         others = [name for name in self.ends if name not in (FULL, *SIMPLER_FIRST)]
         return [name for name in SIMPLER_FIRST if name in self.ends] + others
-
-
-def difference(scores: Mapping[str, np.ndarray], better: str, other: str) -> Difference:
-    """
-    :param scores: algorithm -> one by seed
-    :param better: one of them
-    :param other: another
-    :return: of their means, with Welch's interval: the two may vary differently
-    """
-    one, two = scores[better], scores[other]
-    value = float(one.mean() - two.mean())
-    if min(len(one), len(two)) < 2:
-        return Difference(better, other, value, -math.inf, math.inf)
-    if one.std() == two.std() == 0:
-        return Difference(better, other, value, value, value)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # that one of the two does not vary is no loss of precision
-        low, high = stats.ttest_ind(one, two, equal_var=False).confidence_interval(CONFIDENCE)
-    return Difference(better, other, value, float(low), float(high))
-
-
-def mean_interval(scores: np.ndarray) -> tuple[float, float, float]:
-    """
-    :param scores: one by seed
-    :return: their mean, and the ends of its interval by Student's t, which are infinite with a single seed
-    """
-    mean, count = float(scores.mean()), len(scores)
-    if count < 2:
-        return mean, -math.inf, math.inf
-    half = float(stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) * scores.std(ddof=1) / math.sqrt(count))
-    return mean, mean - half, mean + half
 
 
 def worth(tidy: pd.DataFrame, random_returns: np.ndarray) -> Worth:

@@ -20,7 +20,7 @@ import pandas as pd
 from plotly import graph_objects
 from plotly.subplots import make_subplots
 
-from benchmarks.headroom import mean_interval
+from benchmarks.intervals import mean_interval
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

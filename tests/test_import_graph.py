@@ -36,7 +36,8 @@ FORBIDDEN = {
     "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.(algorithms|envs\.suites)\b)",
     "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
-    "benchmarks/report.py": r"torch\b|sb3_gac\b|benchmarks\b",
+    "benchmarks/report.py": r"torch\b|sb3_gac\b|benchmarks(?!\.intervals\b)",
+    **{f"benchmarks/{name}.py": r"torch\b|sb3_gac\b|benchmarks\b" for name in ("intervals", "bootstrap")},
     "benchmarks/**/*.py": r"sb3_gac\.(.*\.)?_(?!_)",
 }
 

@@ -4,13 +4,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import benchmarks.aggregate
-from benchmarks.aggregate import choose_reference, compare, interval, normalised_scores, run_scores, summarise_cells
+import benchmarks.bootstrap
+from benchmarks.aggregate import choose_reference, compare, normalised_scores, run_scores, summarise_cells
+from benchmarks.bootstrap import interval
 
 
 @pytest.fixture(autouse=True)
 def _few_resamples(monkeypatch):
-    monkeypatch.setattr(benchmarks.aggregate, "BOOTSTRAPS", 200)
+    monkeypatch.setattr(benchmarks.bootstrap, "REPETITIONS", 200)
 
 
 def _evaluations(algorithm, seed, learner, task="T", guider=None):

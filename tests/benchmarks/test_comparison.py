@@ -59,7 +59,7 @@ class InProcess:
 def engine(monkeypatch, tmp_path):
     engine = InProcess()
     monkeypatch.setattr(launch, "LocalEngine", lambda: engine)
-    monkeypatch.setattr("benchmarks.aggregate.BOOTSTRAPS", 10)
+    monkeypatch.setattr("benchmarks.bootstrap.REPETITIONS", 10)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", "")
     return engine

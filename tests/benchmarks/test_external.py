@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 import benchmarks.aggregate
+import benchmarks.bootstrap
 import benchmarks.launch
 import benchmarks.report
 from benchmarks.checkpoint import write_atomically
@@ -179,7 +180,7 @@ def test_launch_aggregate_and_report_read_a_programs_run_like_others(spec, tmp_p
         run(one, runs)
     assert benchmarks.launch.jobs_left(path, runs) == ([], 2)
     monkeypatch.setattr(sys, "argv", ["aggregate", str(path), "--runs", str(runs), "--out", str(out)])
-    monkeypatch.setattr(benchmarks.aggregate, "BOOTSTRAPS", 10)
+    monkeypatch.setattr(benchmarks.bootstrap, "REPETITIONS", 10)
     benchmarks.aggregate.main()
     monkeypatch.setattr(sys, "argv", ["report", str(out)])
     benchmarks.report.main()

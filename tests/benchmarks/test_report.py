@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-import benchmarks.aggregate
+import benchmarks.bootstrap
 from benchmarks.aggregate import compare, summarise_cells
 from benchmarks.report import interactive, main, palette
 
@@ -53,7 +53,7 @@ def test_every_committed_result_can_be_reported(name, tmp_path, monkeypatch, cap
 
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_scores_are_those_of_the_committed_evaluations(name, monkeypatch):
-    monkeypatch.setattr(benchmarks.aggregate, "BOOTSTRAPS", 10)
+    monkeypatch.setattr(benchmarks.bootstrap, "REPETITIONS", 10)
     tidy, results = pd.read_csv(RESULTS / f"{name}.csv"), json.loads((RESULTS / f"{name}.json").read_text())
     assert _points({"cells": summarise_cells(tidy, results["reference"]), **compare(tidy)}) == _points(results)
 

@@ -1,0 +1,62 @@
+"""Stratified bootstraps of 95% over runs and cells (rliable, arXiv 2108.13264)."""
+
+from collections.abc import Callable, Hashable
+from itertools import combinations, permutations
+from typing import Any, TypeVar
+
+import numpy as np
+from rliable import library as rly
+from rliable import metrics
+
+REPETITIONS = 2_000
+#: A value, and the ends of its interval
+Estimate = tuple[float, tuple[float, float]]
+Name = TypeVar("Name", bound=Hashable)
+
+
+def estimate(scores: dict[Name, Any], metric: Callable[..., float]) -> dict[Name, Estimate]:
+    """
+    The same for the same scores: what rliable draws from numpy's global generator starts from one seed.
+
+    :param scores: name -> scores of shape (runs, cells), or what else the metric takes
+    :param metric: of rliable's
+    :return: name -> its value and interval
+    """
+    if not scores:
+        return {}
+
+    def as_array(*arguments: np.ndarray) -> np.ndarray:
+        return np.array([metric(*arguments)])
+
+    state = np.random.get_state()
+    np.random.seed(0)
+    points, intervals = rly.get_interval_estimates(scores, as_array, reps=REPETITIONS)
+    np.random.set_state(state)
+    return {name: (float(points[name][0]), (float(intervals[name][0, 0]), float(intervals[name][1, 0]))) for name in scores}
+
+
+def interval(scores: np.ndarray) -> list[float]:
+    """
+    :param scores: one per run
+    :return: interquartile mean, and the ends of its interval
+    """
+    point, (low, high) = estimate({"one": scores[:, None]}, metrics.aggregate_iqm)["one"]
+    return [round(value, 1) for value in (point, low, high)]
+
+
+def improvements(matrices: dict[str, np.ndarray]) -> dict[str, Estimate]:
+    """
+    Each pair is drawn once: the other way round is the complement.
+
+    :param matrices: algorithm -> scores of shape (runs, cells)
+    :return: "one over other" -> probability that a run of the one scores more than one of the other
+    """
+    pairs = {(one, other): (matrices[one], matrices[other]) for one, other in combinations(matrices, 2)}
+    estimates = estimate(pairs, metrics.probability_of_improvement)
+    estimates |= {(other, one): _complement(drawn) for (one, other), drawn in estimates.items()}
+    return {f"{one} over {other}": estimates[one, other] for one, other in permutations(matrices, 2)}
+
+
+def _complement(drawn: Estimate) -> Estimate:
+    point, (low, high) = drawn
+    return 1 - point, (1 - high, 1 - low)
