@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 CODE := sb3_gac benchmarks tests
 REUSED := $(if $(REUSE_RESULTS),--reuse-results $(REUSE_RESULTS))
 
-.PHONY: train test mutants benchmark format lint type clean
+.PHONY: train test mutants benchmark figure table format lint type clean
 
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -41,6 +41,12 @@ benchmark: $(VENV)/.installed-dev  ## runs of a suite, resumed if need be, to fi
 	$(BIN)/python -m benchmarks.launch benchmarks/suites/$(SUITE).yml $(REUSED)
 	$(BIN)/python -m benchmarks.aggregate benchmarks/suites/$(SUITE).yml $(REUSED) --out benchmarks/results/$(SUITE)
 	$(BIN)/python -m benchmarks.report benchmarks/results/$(SUITE)
+
+figure: $(VENV)/.installed-dev  ## a figure of the paper by number (N=1 to 12), from committed results; ARGS=--run makes those that are missing
+	$(BIN)/python -m benchmarks.paper figure $(N) $(ARGS)
+
+table: $(VENV)/.installed-dev  ## a table of the paper by number (N=2 to 8), and ours beside it
+	$(BIN)/python -m benchmarks.paper table $(N)
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix $(CODE)

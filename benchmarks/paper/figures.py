@@ -1,0 +1,208 @@
+"""A figure of the paper's, drawn from aggregated results."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import pandas as pd
+import yaml
+
+from benchmarks.report import palette, read_tidy, steps_label, title_of
+from benchmarks.suite import HERE, read_suite
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+RESULTS, SUITES = HERE / "results", HERE / "suites"
+SCALES = ("two-cores", "paper")
+RETURNS, POLICIES, KL, KL_COEF = "returns", "policies", "kl", "kl_coef"
+LABELS = {RETURNS: "return", POLICIES: "return", KL: "KL(guider ‖ learner)", KL_COEF: "weight of the KL (kl_coef)"}
+MOST_ACROSS = 4
+MARGIN = 3.0
+
+
+class Group(NamedTuple):
+    """
+    What shares axes.
+
+    :param suites: whose results they are
+    :param algorithms: to draw, all if empty
+    :param tasks: likewise
+    :param noises: likewise
+    :param panels: of each cell, of ``LABELS``
+    :param ends: suites with more steps, of which the last return alone is drawn
+    """
+
+    suites: Sequence[str]
+    algorithms: Sequence[str] = ()
+    tasks: Sequence[str] = ()
+    noises: Sequence[float] = ()
+    panels: Sequence[str] = (RETURNS,)
+    ends: Sequence[str] = ()
+
+    def wanted(self, tidy: pd.DataFrame) -> pd.DataFrame:
+        """
+        :param tidy: aggregated results
+        :return: its rows that belong to this group
+        """
+        for column, values in (("algorithm", self.algorithms), ("task", self.tasks), ("noise", self.noises)):
+            tidy = tidy[tidy[column].isin(values)] if values else tidy
+        return tidy
+
+
+class Figure(NamedTuple):
+    """
+    One of the paper's.
+
+    :param number: in the paper
+    :param title: what it shows
+    :param groups: scale -> what is drawn
+    :param differs: in what the figure at two cores' scale differs from the paper's
+    """
+
+    number: int
+    title: str
+    groups: Mapping[str, Sequence[Group]]
+    differs: Sequence[str]
+
+    def suites(self, scale: str) -> list[str]:
+        """
+        :param scale: one of ``SCALES``
+        :return: names of all suites whose runs it takes, each once
+        """
+        return list(dict.fromkeys(name for group in self.groups[scale] for name in (*group.suites, *group.ends)))
+
+
+def read_figures() -> dict[int, Figure]:
+    """All of them, by number."""
+    content = yaml.safe_load((HERE / "paper/figures.yml").read_text())
+    return {
+        number: Figure(
+            number, one["title"], {scale: [Group(**group) for group in one[scale]] for scale in SCALES}, one["differs"]
+        )
+        for number, one in content.items()
+    }
+
+
+def results_of(suites: Sequence[str]) -> pd.DataFrame:
+    """
+    :param suites: names of suites
+    :return: the aggregated evaluations of all that there are; steps of needed runs count
+    """
+    paths = [RESULTS / f"{name}.csv" for name in suites]
+    frames = [read_tidy(path) for path in paths if path.exists()]
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=["task", "noise", "algorithm"])
+
+
+def needs(name: str) -> str:
+    """
+    :param name: of a suite
+    :return: in words, what it takes to make its runs anew
+    """
+    specs = read_suite(SUITES / f"{name}.yml")
+    steps = f"{len(specs)} runs of {specs[0].steps:,} steps"
+    path = RESULTS / f"{name}.json"
+    if not path.exists():
+        return f"{steps}, none of them made yet"
+    results = json.loads(path.read_text())
+    missing = len(results.get("still_to_run", []))
+    made = f"{len(specs) - missing} of them made" if missing else "all made"
+    median = results["seconds_per_run"].get("median")
+    return f"{steps}, {made}" + (f" in {median / 60:.0f} minutes of a core each (median)" if median else "")
+
+
+def draw(figure: Figure, scale: str, path: Path) -> bool:
+    """
+    :param figure: of the paper
+    :param scale: one of ``SCALES``
+    :param path: of the picture
+    :return: whether there was anything to draw; if not, there is no picture
+    """
+    found = [_Drawn(one, *(one.wanted(results_of(names)) for names in (one.suites, one.ends))) for one in figure.groups[scale]]
+    drawn = [one for one in found if one.cells]
+    if not drawn:
+        return False
+    size = (max(4.0 * max(one.across for one in drawn), 6.5), 3.1 * sum(one.down for one in drawn) + 0.4)
+    whole = plt.figure(figsize=size, layout="constrained")
+    whole.suptitle(f"Figure {figure.number}: {figure.title}", fontsize="medium")
+    colors = palette(list(dict.fromkeys(name for one in drawn for name in (*one.tidy.algorithm, *one.ends.algorithm))))
+    parts = whole.subfigures(len(drawn), 1, height_ratios=[one.down for one in drawn], squeeze=False).flat
+    for part, one in zip(parts, drawn, strict=True):
+        _draw_group(part.subplots(one.down, one.across, squeeze=False).flat, one, colors)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    whole.savefig(path, dpi=80)
+    plt.close(whole)
+    return True
+
+
+class _Drawn(NamedTuple):
+    """A group with its rows of results."""
+
+    group: Group
+    tidy: pd.DataFrame
+    ends: pd.DataFrame
+
+    @property
+    def cells(self) -> list[tuple[str, float]]:
+        tasks = list(self.tidy.task.unique())
+        cells = dict.fromkeys(zip(self.tidy.task, self.tidy.noise, strict=True))
+        return sorted(cells, key=lambda cell: (tasks.index(cell[0]), cell[1]))
+
+    @property
+    def across(self) -> int:
+        """Columns: a cell's panels are side by side."""
+        panels = len(self.group.panels)
+        return min(len(self.cells), max(MOST_ACROSS // panels, 1)) * panels
+
+    @property
+    def down(self) -> int:
+        return math.ceil(len(self.cells) * len(self.group.panels) / self.across)
+
+
+def _draw_group(axes: Iterator[Axes], one: _Drawn, colors: Mapping[str, str]) -> None:
+    first = True
+    for task, noise in one.cells:
+        cell, ends = (frame[(frame.task == task) & (frame.noise == noise)] for frame in (one.tidy, one.ends))
+        for panel in one.group.panels:
+            axis = next(axes)
+            _draw_panel(axis, panel, cell, ends, colors)
+            axis.set(title=title_of(task, noise), xlabel=f"thousand {steps_label(one.tidy)}", ylabel=LABELS[panel])
+            axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}")
+            if first or panel != RETURNS:
+                axis.legend(fontsize="x-small")
+            first = False
+    for axis in axes:
+        axis.set_axis_off()
+
+
+def _draw_panel(axis: Axes, panel: str, cell: pd.DataFrame, ends: pd.DataFrame, colors: Mapping[str, str]) -> None:
+    for name, group in cell.groupby("algorithm", sort=False):
+        _draw_algorithm(axis, panel, group, str(name), colors[str(name)])
+    if panel in (KL, KL_COEF):
+        axis.set_yscale("log")
+        low, high = (value for value in axis.get_ylim())
+        axis.set_ylim(low / MARGIN, high * MARGIN)  # a steady line is to look steady
+    if panel == KL and cell.target_kl.nunique() == 1:
+        axis.axhline(cell.target_kl.max(), color="black", linestyle=":", label="target_kl")
+    if panel in (RETURNS, POLICIES):
+        for name, group in ends.groupby("algorithm", sort=False):
+            last = group.timesteps.max()
+            mean = group[group.timesteps == last].learner.mean()
+            axis.axhline(mean, color=colors[str(name)], linestyle="-.", label=f"{name} after {last:,}")
+
+
+def _draw_algorithm(axis: Axes, panel: str, group: pd.DataFrame, name: str, color: str) -> None:
+    """The mean over seeds; of returns each seed's curve as well, in thin lines."""
+    column = panel if panel in (KL, KL_COEF) else "learner"
+    mean = group.groupby("timesteps")[column].mean()
+    axis.plot(mean.index, mean, color=color, label=name, linewidth=2)
+    if column == "learner":
+        for _, run in group.groupby("seed"):
+            axis.plot(run.timesteps, run.learner, color=color, linewidth=0.7, alpha=0.4)
+    if panel == POLICIES:
+        guider = group.groupby("timesteps").guider.mean()
+        axis.plot(guider.index, guider, color=color, linestyle="--", label=f"{name}, guider")
