@@ -1,6 +1,7 @@
 """Stratified bootstraps of 95% over runs and cells (rliable, arXiv 2108.13264)."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from itertools import combinations, permutations
 from typing import Any, TypeVar
 
@@ -12,6 +13,17 @@ REPETITIONS = 2_000
 #: A value, and the ends of its interval
 Estimate = tuple[float, tuple[float, float]]
 Name = TypeVar("Name", bound=Hashable)
+
+
+@contextmanager
+def _from_one_seed() -> Iterator[None]:
+    """Whatever numpy's global generator has drawn before, and without a trace in it."""
+    state = np.random.get_state()
+    np.random.seed(0)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)
 
 
 def estimate(scores: dict[Name, Any], metric: Callable[..., float]) -> dict[Name, Estimate]:
@@ -28,10 +40,8 @@ def estimate(scores: dict[Name, Any], metric: Callable[..., float]) -> dict[Name
     def as_array(*arguments: np.ndarray) -> np.ndarray:
         return np.array([metric(*arguments)])
 
-    state = np.random.get_state()
-    np.random.seed(0)
-    points, intervals = rly.get_interval_estimates(scores, as_array, reps=REPETITIONS)
-    np.random.set_state(state)
+    with _from_one_seed():
+        points, intervals = rly.get_interval_estimates(scores, as_array, reps=REPETITIONS)
     return {name: (float(points[name][0]), (float(intervals[name][0, 0]), float(intervals[name][1, 0]))) for name in scores}
 
 
@@ -60,3 +70,15 @@ def improvements(matrices: dict[str, np.ndarray]) -> dict[str, Estimate]:
 def _complement(drawn: Estimate) -> Estimate:
     point, (low, high) = drawn
     return 1 - point, (1 - high, 1 - low)
+
+
+def profile(scores: dict[str, np.ndarray], thresholds: np.ndarray) -> dict[str, np.ndarray]:
+    """
+    :param scores: algorithm -> one by run, of all cells together
+    :param thresholds: scores, shape (T,)
+    :return: algorithm -> the share of its runs above each threshold, and the ends of its interval, shape (3, T)
+    """
+    matrices = {name: of_runs[:, None] for name, of_runs in scores.items()}
+    with _from_one_seed():
+        shares, intervals = rly.create_performance_profile(matrices, thresholds, reps=REPETITIONS)
+    return {name: np.stack([shares[name], *intervals[name]]) for name in scores}

@@ -19,6 +19,7 @@ from scipy import stats
 
 from benchmarks.finished import read_tidy
 from benchmarks.intervals import CONFIDENCE, Difference, difference, mean_interval
+from benchmarks.page.summary import listed
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
@@ -249,14 +250,6 @@ def title(algorithm: str) -> str:
     :return: what it is called in sentences
     """
     return TITLES.get(algorithm, algorithm)
-
-
-def listed(names: Sequence[str]) -> str:
-    """
-    :param names: at least one
-    :return: as in "a, b and c"
-    """
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
 def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:

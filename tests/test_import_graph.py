@@ -21,6 +21,7 @@ ROOMS = {
     "base": "algorithms|base|math|checks|schedules|optim|networks|replay|checkpoint|envs",
     "deploy": "deploy|base|checks|networks|envs|learner|version",
 }
+DRAWING = "page|intervals|bootstrap"
 FORBIDDEN = {
     **{f"sb3_gac/{room}/**/*.py": rf"sb3_gac(?!\.({allowed})\b)" for room, allowed in ROOMS.items()},
     **{f"sb3_gac/envs/{path}.py": r"torch\b|stable_baselines3|sb3_gac(?!\.envs\b)" for path in ("*", "suites/**/*")},
@@ -36,7 +37,7 @@ FORBIDDEN = {
     "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.(algorithms|envs\.suites)\b)",
     "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
-    "benchmarks/report.py": r"torch\b|sb3_gac\b|benchmarks(?!\.intervals\b)",
+    **{f"benchmarks/{path}.py": rf"torch\b|sb3_gac\b|benchmarks(?!\.({DRAWING})\b)" for path in ("report", "page/**/*")},
     **{f"benchmarks/{name}.py": r"torch\b|sb3_gac\b|benchmarks\b" for name in ("intervals", "bootstrap")},
     "benchmarks/**/*.py": r"sb3_gac\.(.*\.)?_(?!_)",
 }

@@ -10,7 +10,8 @@ import matplotlib
 import pandas as pd
 import yaml
 
-from benchmarks.report import palette, read_tidy, steps_label, title_of
+from benchmarks.page.plots import palette, steps_label, title_of
+from benchmarks.report import read_tidy
 from benchmarks.suite import HERE, read_suite
 
 matplotlib.use("Agg")

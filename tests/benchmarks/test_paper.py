@@ -53,6 +53,7 @@ def drawn(tmp_path, monkeypatch):
 def test_there_are_all_of_the_papers_figures_and_tables():
     assert sorted(FIGURES) == list(range(1, 13)), "that show results; its tables are settings and sizes"
     assert sorted(TABLES) == list(range(2, 9))
+    assert FIGURES[1].suites("two-cores") == ["first-figure", "baselines", "baselines-taught", "baselines-on-policy"]
 
 
 @pytest.mark.parametrize("scale", SCALES)

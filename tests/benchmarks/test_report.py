@@ -12,7 +12,8 @@ import pytest
 
 import benchmarks.bootstrap
 from benchmarks.aggregate import compare, summarise_cells
-from benchmarks.report import interactive, main, palette
+from benchmarks.page.plots import palette
+from benchmarks.report import interactive, main
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -35,7 +36,8 @@ def _tidy(algorithms, guider=False):
 def test_every_committed_result_can_be_reported(name, tmp_path, monkeypatch, capsys):
     for suffix in (".csv", ".json"):
         shutil.copy(RESULTS / f"{name}{suffix}", tmp_path)
-    monkeypatch.setattr(sys, "argv", ["report", str(tmp_path / name)])
+    monkeypatch.setattr(benchmarks.bootstrap, "REPETITIONS", 10)
+    monkeypatch.setattr(sys, "argv", ["report", str(tmp_path / name), "--formats", "png"])
     main()
     page = (tmp_path / f"{name}.html").read_text()
     assert "python -m benchmarks.launch" in page
@@ -49,6 +51,18 @@ def test_every_committed_result_can_be_reported(name, tmp_path, monkeypatch, cap
         + r"(, after [\d,]+ steps of needed runs)? \|"
     )
     assert re.search(row, capsys.readouterr().out)
+
+
+def test_the_figure_comes_in_all_formats(tmp_path, monkeypatch):
+    for suffix in (".csv", ".json"):
+        shutil.copy(RESULTS / f"std{suffix}", tmp_path)
+    monkeypatch.setattr(benchmarks.bootstrap, "REPETITIONS", 10)
+    monkeypatch.setattr(sys, "argv", ["report", str(tmp_path / "std")])
+    main()
+    made = {path.suffix: path.read_bytes() for path in tmp_path.iterdir()}
+    assert set(made) == {".csv", ".json", ".html", ".png", ".pdf", ".svg"}
+    assert made[".pdf"].startswith(b"%PDF")
+    assert b"<svg" in made[".svg"]
 
 
 @pytest.mark.parametrize("name", COMMITTED)

@@ -1,0 +1,127 @@
+"""The page itself."""
+
+import html
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+from plotly.offline import get_plotlyjs
+
+from benchmarks.page.plots import Plot, plots
+from benchmarks.page.summary import in_short, what_was_compared
+from benchmarks.page.tables import differences_table, overall_table, returns_table
+
+HERE = Path(__file__).parent
+
+
+def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> str:
+    """
+    :param tidy: as aggregated
+    :param results: as aggregated
+    :param title: of the page
+    :param runs: directory of all runs, as seen from the page: where its links to logs go
+    :return: HTML that needs nothing else
+    """
+    seconds = {name: run["seconds"] for name, run in results["runs"].items() if run.get("seconds")}
+    drawn = plots(tidy, seconds, normalised_returns(results))
+    short = "".join(f"<li>{html.escape(text)}</li>" for text in in_short(results))
+    body = (
+        f"<h1>{html.escape(title)}</h1><p>{html.escape(what_was_compared(results))}</p>"
+        f"<ul class=short>{short}</ul>{tabs(drawn)}"
+        f"<h2>Returns</h2>{returns_table(results['cells'])}{_notes()}"
+        f"<h2>Over all cells</h2>{overall_table(results)}"
+        f"<h2>How it was made</h2>{_origin(results)}{_logs(results['runs'], runs)}"
+    )
+    return document(title, body)
+
+
+def document(title: str, body: str) -> str:
+    """
+    :param title: of the page
+    :param body: HTML, with :func:`tabs` in it
+    :return: a page that draws them, and sorts tables
+    """
+    style, script = ((HERE / name).read_text() for name in ("page.css", "page.js"))
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{style}</style></head><body>{body}"
+        f"<script>{get_plotlyjs()}</script><script>{script}</script></body></html>"
+    )
+
+
+def normalised_returns(results: dict[str, Any]) -> pd.DataFrame:
+    """
+    :param results: as aggregated
+    :return: a row for each run of the algorithms that are compared over all cells: "algorithm", "normalised"
+    """
+    compared = results["compared"]
+    scales = {(cell["task"], cell["noise"]): cell for cell in compared["cells"]}
+    rows = []
+    for cell in results["cells"]:
+        scale = scales.get((cell["task"], cell["noise"]))
+        if scale is None or cell["algorithm"] not in compared["algorithms"]:
+            continue
+        span = scale["high"] - scale["low"] or 1.0
+        rows += [{"algorithm": cell["algorithm"], "normalised": (end - scale["low"]) / span} for end in cell["final"]]
+    return pd.DataFrame(rows, columns=["algorithm", "normalised"])
+
+
+def tabs(drawn: Sequence[Plot]) -> str:
+    """
+    :param drawn: at least one
+    :return: HTML: plots behind buttons; the page's script draws the chosen one
+    """
+    figures = {one.name: _as_data(one) for one in drawn}
+    buttons = "".join(
+        f'<button role=tab data-figure="{html.escape(one.name)}" aria-selected=false>{html.escape(one.name)}</button>'
+        for one in drawn
+    )
+    data = json.dumps(figures).replace("</", "<\\/")
+    return (
+        f'<nav role=tablist>{buttons}</nav><figure style="margin:0"><div id=plot class=plot></div>'
+        f'<figcaption id=caption></figcaption></figure><script type="application/json" id=figures>{data}</script>'
+    )
+
+
+def _as_data(plot: Plot) -> dict[str, Any]:
+    """Curves once; they are the same at either width."""
+    wide, narrow = (json.loads(figure.to_json()) for figure in (plot.wide, plot.narrow))
+    return {"data": wide["data"], "wide": wide["layout"], "narrow": narrow["layout"], "caption": plot.caption}
+
+
+def _notes() -> str:
+    return (
+        "<p class=note>Bold: the highest mean of its cell. The end is the last evaluation. The interval of the mean is by "
+        "Student's t. The interquartile mean of three or fewer seeds is their mean, and has no column. A click on a column's "
+        "name sorts.</p>"
+    )
+
+
+def _origin(results: dict[str, Any]) -> str:
+    """Command, differences of arguments, what is shared, and what it was made with."""
+    differing, shared = differences_table(results["arguments"]) if "arguments" in results else ("", {})
+    settings = yaml.safe_dump({**results.get("settings", {}), "arguments of all": shared}, sort_keys=False)
+    known = ("made_with", "mixed_runs", "cpus", "hours", "timed_runs", "seconds_per_run", "particulars", "still_to_run")
+    origin = yaml.safe_dump({key: results[key] for key in known if key in results}, sort_keys=False)
+    return (
+        f"<p>Runs, or those that are missing, and these results again:</p><pre>{html.escape(results['command'])}</pre>"
+        f"<details><summary>In what the algorithms differ</summary>{differing}</details>"
+        f"<details><summary>Settings of all</summary><pre>{html.escape(settings)}</pre></details>"
+        f"<details><summary>Versions, commits and hours</summary><pre>{html.escape(origin)}</pre></details>"
+    )
+
+
+def _logs(names: Sequence[str], runs: str) -> str:
+    links = "".join(f"<li>{_link(f'{runs}/{name}', name)}</li>" for name in names)
+    return (
+        "<details><summary>Runs</summary><p>Each with log.txt, its TensorBoard log, configuration and model, on the machine "
+        f"that made this page.</p><ul>{links}</ul></details>"
+    )
+
+
+def _link(target: str, text: str) -> str:
+    return f'<a href="{html.escape(target, quote=True)}">{html.escape(text)}</a>'

@@ -1,0 +1,319 @@
+"""Curves of a suite's results to hover over and switch off."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from plotly import graph_objects
+from plotly.subplots import make_subplots
+
+from benchmarks.bootstrap import profile
+from benchmarks.intervals import mean_interval
+
+COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#7f7f7f")
+STEPS, RETURN, NOT_RUN = "environment steps", "return", "not run yet"
+WITH_NEEDED = "environment steps, with those of needed runs"
+NO_NOISE = -1.0  # in the place of a noise, for environments that are not asked for one
+NEEDED = "needed_steps"
+ROW_HEIGHT, FRAME = 330, 110
+Lines = Callable[[pd.DataFrame, str, str], list[graph_objects.Scatter]]
+
+
+class Plot(NamedTuple):
+    """
+    One tab of the page.
+
+    :param name: on the tab
+    :param wide: for a desktop
+    :param narrow: for a phone; the same curves, one cell below the other
+    :param caption: what is seen, and how
+    """
+
+    name: str
+    wide: graph_objects.Figure
+    narrow: graph_objects.Figure
+    caption: str
+
+
+def curves(group: pd.DataFrame, column: str = "learner") -> pd.DataFrame:
+    """
+    :param group: one algorithm in one cell
+    :param column: what to average
+    :return: indexed by environment steps: mean over seeds, and the ends of its interval of 95% by Student's t, which for
+        three seeds is 4.3 standard errors to either side; of a single seed there is none, and the ends are the mean
+    """
+    rows = {step: mean_interval(of_seeds.dropna().to_numpy()) for step, of_seeds in group.groupby("timesteps")[column]}
+    found = pd.DataFrame(rows, index=["mean", "low", "high"]).T
+    return found.where(np.isfinite(found), found["mean"], axis=0)
+
+
+def steps_label(tidy: pd.DataFrame) -> str:
+    """
+    :param tidy: aggregated evaluations
+    :return: what its timesteps are
+    """
+    return WITH_NEEDED if NEEDED in tidy else STEPS
+
+
+def title_of(task: str, noise: float) -> str:
+    """
+    :param task: of a cell
+    :param noise: of a cell
+    :return: the cell's title
+    """
+    return task if noise == NO_NOISE else f"{task}, noise {noise:g}"
+
+
+def is_wanted(tidy: pd.DataFrame, task: str, noise: float) -> bool:
+    """
+    :param tidy: as aggregated
+    :param task: of a cell
+    :param noise: of a cell
+    :return: whether there is, or could be, such a cell: tasks with a noise and tasks without one share a figure
+    """
+    without = (tidy[tidy.task == task].noise == NO_NOISE).unique()
+    return (noise == NO_NOISE) in without
+
+
+def grid(tidy: pd.DataFrame) -> tuple[list[str], list[float], list[str]]:
+    """Tasks, noises and algorithms, in the order of the runs."""
+    return list(tidy.task.unique()), sorted(tidy.noise.unique()), list(tidy.algorithm.unique())
+
+
+def palette(algorithms: list[str]) -> dict[str, str]:
+    """
+    :param algorithms: any number
+    :return: a color for each, in the same order
+    """
+    if len(algorithms) <= len(COLORS):
+        return dict(zip(algorithms, COLORS, strict=False))
+    hues = matplotlib.colormaps["hsv"]
+    return {name: matplotlib.colors.to_hex(hues(index / len(algorithms))) for index, name in enumerate(algorithms)}
+
+
+def has_guider(group: pd.DataFrame) -> bool:
+    """
+    :param group: one algorithm in one cell
+    """
+    return "guider" in group and bool(group.guider.notna().any())
+
+
+def guider_of(algorithm: str) -> str:
+    """
+    :param algorithm: its name
+    :return: that of its guider's curve
+    """
+    return f"{algorithm}, guider"
+
+
+def _line(algorithm: str, x: Any, y: Any, name: str, **style: Any) -> graph_objects.Scatter:
+    return graph_objects.Scatter(x=list(x), y=list(y), name=name, legendgroup=algorithm, **{"mode": "lines", **style})
+
+
+def algorithm_lines(group: pd.DataFrame, algorithm: str, color: str) -> list[graph_objects.Scatter]:
+    """
+    :param group: one algorithm in one cell
+    :param algorithm: its name
+    :param color: its color
+    :return: each seed's curve, the interval around the mean as a band, the mean, and the guider's mean in dashes. Over a
+        step the mean tells its interval and each seed's return
+    """
+    thin: dict[str, Any] = {"line": {"color": color, "width": 0.7}, "opacity": 0.5, "hoverinfo": "skip"}
+    runs = group.groupby("seed")
+    lines = [_line(algorithm, run.timesteps, run.learner, f"{algorithm}, seed {seed}", **thin) for seed, run in runs]
+    learner = curves(group)
+    there, back = list(learner.index), list(learner.index[::-1])
+    band: dict[str, Any] = {"fill": "toself", "line": {"color": color, "width": 0}, "opacity": 0.15, "hoverinfo": "skip"}
+    lines.append(_line(algorithm, there + back, [*learner.high, *learner.low[::-1]], f"{algorithm}, 95% of the mean", **band))
+    lines.append(_line(algorithm, learner.index, learner["mean"], algorithm, **_told(group, learner, color)))
+    if has_guider(group):
+        guider = curves(group, "guider")["mean"]
+        dashes = {"line": {"color": color, "width": 1, "dash": "dash"}, "hovertemplate": "%{y:,.4~g}"}
+        lines.append(_line(algorithm, guider.index, guider, guider_of(algorithm), **dashes))
+    return lines
+
+
+def _told(group: pd.DataFrame, learner: pd.DataFrame, color: str) -> dict[str, Any]:
+    """The mean's style, and what is told over it."""
+    at_steps = group.groupby("timesteps").learner
+    several = [
+        [f"{low:,.4g} to {high:,.4g}", ", ".join(f"{value:,.4g}" for value in at_steps.get_group(step))]
+        for step, low, high in zip(learner.index, learner.low, learner.high, strict=True)
+    ]
+    text = "%{y:,.4~g}  (%{customdata[0]}; seeds %{customdata[1]})"
+    return {"line": {"color": color}, "customdata": several, "hovertemplate": text}
+
+
+def in_cells(
+    tidy: pd.DataFrame, lines_of: Lines, y_title: str, x_title: str, one_column: bool = False
+) -> graph_objects.Figure:
+    """
+    :param tidy: as aggregated
+    :param lines_of: one algorithm in one cell, its name, its color -> its curves
+    :param y_title: of all axes
+    :param x_title: likewise
+    :param one_column: whether cells are below each other; else tasks are across and noises down
+    :return: the cells, each with its curves; a click on a name switches an algorithm off in all of them
+    """
+    tasks, noises, algorithms = grid(tidy)
+    cells = {(task, noise): is_wanted(tidy, task, noise) for noise in noises for task in tasks}
+    titles = [title_of(*cell) if wanted else "" for cell, wanted in cells.items()]
+    columns = 1 if one_column else len(tasks)
+    rows = len(cells) // columns
+    gap = {"vertical_spacing": 0.3 / rows, "horizontal_spacing": 0.28 / columns}  # where names of axes go
+    figure = make_subplots(rows=rows, cols=columns, subplot_titles=titles, **gap)
+    figure.update_xaxes(title_text=x_title)
+    figure.update_yaxes(title_text=y_title)
+    named: set[str] = set()
+    for place, ((task, noise), wanted) in enumerate(cells.items()):
+        row, column = place // columns + 1, place % columns + 1
+        cell = tidy[(tidy.task == task) & (tidy.noise == noise)]
+        if cell.empty:
+            _say(figure, row, column, NOT_RUN if wanted else "")
+        for algorithm, color in palette(algorithms).items():
+            group = cell[cell.algorithm == algorithm]
+            lines = lines_of(group, algorithm, color) if not group.empty else []
+            for line in lines:
+                line.showlegend = line.name in (algorithm, guider_of(algorithm)) and line.name not in named
+            named.update(line.name for line in lines)
+            figure.add_traces(lines, rows=row, cols=column)
+        if not cell.empty:
+            figure.update_yaxes(range=_range(figure, place), row=row, col=column)
+    return figure.update_layout(**_frame(rows))
+
+
+def _range(figure: graph_objects.Figure, place: int) -> tuple[float, float]:
+    """Of a cell's lines: what the intervals of few seeds reach beyond them says nothing more, and would hide the rest."""
+    axis = "y" if place == 0 else f"y{place + 1}"
+    values = np.concatenate([line.y for line in figure.data if line.yaxis == axis and line.fill is None] or [[0.0, 1.0]])
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    margin = 0.05 * (high - low) or 1.0
+    return low - margin, high + margin
+
+
+def _say(figure: graph_objects.Figure, row: int, column: int, text: str) -> None:
+    """A word in place of curves. (No note can refer to the axes of a place where nothing is drawn.)"""
+    place = figure.get_subplot(row, column)
+    x, y = (sum(axis.domain) / 2 for axis in (place.xaxis, place.yaxis))
+    figure.add_annotation(text=text, x=x, y=y, xref="paper", yref="paper", showarrow=False)
+    figure.update_xaxes(visible=False, row=row, col=column)
+    figure.update_yaxes(visible=False, row=row, col=column)
+
+
+def _frame(rows: int) -> dict[str, Any]:
+    return {
+        "height": ROW_HEIGHT * rows + FRAME,
+        "hovermode": "x unified",
+        "hoverlabel": {"namelength": -1},
+        "legend": {"orientation": "h", "yref": "container", "y": 1, "yanchor": "top"},
+        "margin": {"l": 60, "r": 20, "t": 90, "b": 50},
+        "template": "plotly_white",
+    }
+
+
+def interactive(tidy: pd.DataFrame, one_column: bool = False) -> graph_objects.Figure:
+    """
+    :param tidy: as aggregated
+    :param one_column: see :func:`in_cells`
+    :return: returns over steps
+    """
+    return in_cells(tidy, algorithm_lines, RETURN, steps_label(tidy), one_column)
+
+
+def _mean_line(column: str, group: pd.DataFrame, algorithm: str, color: str) -> list[graph_objects.Scatter]:
+    """The mean over seeds of what not all algorithms have."""
+    if column not in group or group[column].isna().all():
+        return []
+    mean = group.groupby("timesteps")[column].mean()
+    line = {"line": {"color": color}, "hovertemplate": "%{y:,.4~g}"}
+    return [_line(algorithm, mean.index, mean, algorithm, **line)]
+
+
+def _plot(name: str, tidy: pd.DataFrame, lines_of: Lines, y_title: str, x_title: str, caption: str) -> Plot:
+    wide, narrow = (in_cells(tidy, lines_of, y_title, x_title, one_column) for one_column in (False, True))
+    return Plot(name, wide, narrow, caption)
+
+
+def plots(tidy: pd.DataFrame, seconds: Mapping[str, float], normalised: pd.DataFrame) -> list[Plot]:
+    """
+    :param tidy: as aggregated
+    :param seconds: run -> how long it took; of none, nothing is drawn over them
+    :param normalised: a row for each run: "task", "noise", "algorithm", "normalised"
+    :return: the tabs, those alone that there are data for
+    """
+    steps = steps_label(tidy)
+    drawn = [_plot("Returns", tidy, algorithm_lines, RETURN, steps, _RETURNS)]
+    timed = over_seconds(tidy, seconds)
+    if not timed.empty:
+        drawn.append(_plot("Returns over seconds", timed, algorithm_lines, RETURN, "seconds of one core", _SECONDS))
+    if has_guider(tidy):
+        gap = tidy.assign(gap=tidy.guider - tidy.learner).dropna(subset="gap")
+        lines = partial(_mean_line, "gap")
+        drawn.append(_plot("Guider over learner", gap, lines, "guider's return - learner's", steps, _GAP))
+    if {"kl", "target_kl"} <= set(tidy) and tidy.kl.notna().any():
+        ratio = tidy.assign(ratio=tidy.kl / tidy.target_kl).dropna(subset="ratio")
+        drawn.append(_plot("KL", ratio, partial(_mean_line, "ratio"), "KL / target_kl", steps, _KL))
+    if not normalised.empty:
+        drawn.append(_profile(normalised))
+    return drawn
+
+
+_RETURNS = (
+    "Return of what is deployed, at evaluations on environments that training never sees. Lines are means over seeds, thin "
+    "lines the seeds, bands 95% intervals of the mean by Student's t, cut off beyond the runs; dashes are the guider, which "
+    "sees the privileged entries too. A click on a name switches an algorithm off."
+)
+_SECONDS = (
+    "The same over the time that a run took on one core, evaluations included; a run's seconds are spread evenly over its "
+    "steps. Lines end where a run ended. Runs may have shared their machine with others."
+)
+_GAP = "How much more the guider returns than the learner, by the same evaluations: what the learner can't do (imitation gap)."
+_KL = "KL(guider || learner) over its target, mean over seeds: 1 where the constraint holds."
+_PROFILE = (
+    "Performance profile: the share of all runs, in all cells, that end above a score; 0 is the lowest point of any mean "
+    "curve in the cell, 1 its best algorithm's mean end. The higher line is the better algorithm. Bands are 95% bootstrap "
+    "intervals."
+)
+
+
+def over_seconds(tidy: pd.DataFrame, seconds: Mapping[str, float]) -> pd.DataFrame:
+    """
+    :param tidy: as aggregated
+    :param seconds: run -> how long it took
+    :return: the evaluations of timed runs, with the mean seconds of their algorithm in the cell at that step in place of
+        timesteps
+    """
+    keys = ["task", "noise", "algorithm", "seed"]
+    found = {key: taken for key, _ in tidy.groupby(keys) if (taken := _of_run(key, seconds)) is not None}
+    rows = tidy[[tuple(row) in found for row in tidy[keys].itertuples(index=False)]].drop(columns=NEEDED, errors="ignore")
+    if rows.empty:
+        return rows
+    taken = pd.Series([found[tuple(row)] for row in rows[keys].itertuples(index=False)], index=rows.index)
+    mean = taken.groupby([rows[key] for key in keys[:3]]).transform("mean")
+    last = rows.groupby(keys).timesteps.transform("max")
+    return rows.assign(timesteps=(mean * rows.timesteps / last).round(2))
+
+
+def _of_run(key: Any, seconds: Mapping[str, float]) -> float | None:
+    task, noise, algorithm, seed = key
+    cell = task if noise == NO_NOISE else f"{task}-noise{noise:g}"
+    end = f"/{cell}/{algorithm}/seed{seed}"
+    return next((taken for name, taken in seconds.items() if taken is not None and name.endswith(end)), None)
+
+
+def _profile(normalised: pd.DataFrame) -> Plot:
+    scores = np.linspace(min(0.0, normalised.normalised.min()), max(1.0, normalised.normalised.max()), 61)
+    figure = graph_objects.Figure()
+    of_algorithms = {str(name): group.normalised.to_numpy() for name, group in normalised.groupby("algorithm", sort=False)}
+    found = profile(of_algorithms, scores)
+    for name, color in palette(list(of_algorithms)).items():
+        share, low, high = found[name]
+        band: dict[str, Any] = {"fill": "toself", "line": {"color": color, "width": 0}, "opacity": 0.15, "hoverinfo": "skip"}
+        around = _line(name, [*scores, *scores[::-1]], [*high, *low[::-1]], f"{name}, 95%", showlegend=False, **band)
+        figure.add_traces([around, _line(name, scores, share, name, line={"color": color}, hovertemplate="%{y:.0%}")])
+    figure.update_layout(xaxis_title="normalised score", yaxis_title="share of runs above it", **_frame(1))
+    figure.update_yaxes(tickformat=".0%")
+    return Plot("Performance profile", figure, figure, _PROFILE)

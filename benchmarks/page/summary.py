@@ -1,0 +1,85 @@
+"""What a suite's results say, in sentences."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+SURE = 0.5  # of the probability of improvement: neither
+
+
+def what_was_compared(results: dict[str, Any]) -> str:
+    """
+    :param results: as aggregated
+    :return: a sentence: algorithms, cells, steps and seeds
+    """
+    cells = results["cells"]
+    algorithms = list(dict.fromkeys(cell["algorithm"] for cell in cells))
+    tasks = list(dict.fromkeys(cell["task"] for cell in cells))
+    noises = sorted({cell["noise"] for cell in cells if cell["noise"] is not None})
+    at = f", sensor noise {listed([f'{noise:g}' for noise in noises])}" if noises else ""
+    seeds = {len(cell["seeds"]) for cell in cells}
+    count = f"{min(seeds)} to {max(seeds)}" if len(seeds) > 1 else f"{min(seeds)}"
+    steps = f"{results['settings']['steps']:,} environment steps, " if "settings" in results else ""
+    plural = "" if seeds == {1} else "s"
+    return f"{listed(algorithms)} on {listed(tasks)}{at}: {steps}{count} seed{plural} of each."
+
+
+def in_short(results: dict[str, Any]) -> list[str]:
+    """
+    :param results: as aggregated
+    :return: sentences: who ends highest, how sure that is, what the intervals are, and what is still to run
+    """
+    sentences = [*_highest(results), *_overall(results), *_about_seeds(results)]
+    if missing := len(results.get("still_to_run", [])):
+        one = missing == 1
+        sentences.append(f"{missing} run{'' if one else 's'} of the suite {'is' if one else 'are'} still to make.")
+    return sentences
+
+
+def _highest(results: dict[str, Any]) -> list[str]:
+    best: dict[Any, Any] = {}
+    several = Counter((cell["task"], cell["noise"]) for cell in results["cells"])
+    for cell in results["cells"]:
+        key = (cell["task"], cell["noise"])
+        if several[key] > 1 and (key not in best or cell["final_mean"] > best[key]["final_mean"]):
+            best[key] = cell
+    if not best:
+        return []
+    counts = Counter(cell["algorithm"] for cell in best.values()).most_common()
+    if len(best) == 1:
+        return [f"{counts[0][0]} has the highest mean return at the end."]
+    (first, count), *others = counts
+    rest = "".join(f", {name} in {number}" for name, number in others)
+    return [f"{first} has the highest mean return at the end in {count} of {len(best)} cells{rest}."]
+
+
+def _overall(results: dict[str, Any]) -> list[str]:
+    ranked = sorted(results["normalised_iqm"], key=lambda name: -results["normalised_iqm"][name][0])
+    if len(ranked) < 2:
+        return []
+    first, second = ranked[:2]
+    value, low, high = results["probability_of_improvement"][f"{first} over {second}"]
+    sure = "beyond chance" if low > SURE else "which these runs can't tell from chance"
+    return [
+        f"Over all cells {first} comes first and {second} second (interquartile mean of normalised returns "
+        f"{results['normalised_iqm'][first][0]:.2f} and {results['normalised_iqm'][second][0]:.2f}). A run of {first} ends "
+        f"above one of {second} with probability {value:.2f} (95% interval {low:.2f} to {high:.2f}), {sure}."
+    ]
+
+
+def _about_seeds(results: dict[str, Any]) -> list[str]:
+    fewest = min(len(cell["seeds"]) for cell in results["cells"])
+    if fewest >= 5:
+        return []
+    if fewest == 1:
+        return ["One seed can't tell a difference from chance."]
+    factor = {2: "12.7", 3: "4.3", 4: "3.2"}[fewest]
+    return [f"{fewest} seeds are few: an interval of their mean is {factor} standard errors to either side (Student's t)."]
+
+
+def listed(names: Sequence[str]) -> str:
+    """
+    :param names: at least one
+    :return: as in "a, b and c"
+    """
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

@@ -1,0 +1,149 @@
+"""The page's tables: returns, comparisons, and in what the algorithms' arguments differ."""
+
+import html
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.intervals import mean_interval
+
+_SHORT = 30  # letters that are not to be broken
+
+
+class Field(NamedTuple):
+    """
+    Of a table.
+
+    :param text: that is shown
+    :param value: that is sorted by, if it is a number
+    """
+
+    text: str
+    value: float | None = None
+
+    def html(self) -> str:
+        """Of a table's row."""
+        if self.value is None:
+            short = " class=short-text" if len(self.text) <= _SHORT else ""
+            return f"<td{short}>{html.escape(self.text)}</td>"
+        return f'<td class=number data-value="{self.value:.6g}">{html.escape(self.text)}</td>'
+
+
+def number(value: float | None, digits: int = 0) -> Field:
+    """
+    :param value: ``None`` for an empty field, which is sorted below all others
+    :param digits: after the point
+    """
+    return Field("", -math.inf) if value is None else Field(f"{value:,.{digits}f}", value)
+
+
+def table(head: Sequence[str], rows: Sequence[tuple[Sequence[Field], bool]], sortable: bool = True) -> str:
+    """
+    :param head: names of columns
+    :param rows: fields, and whether they are the best of their kind
+    :param sortable: whether a click on a name sorts by it
+    :return: HTML
+    """
+    mark = " data-sortable" if sortable else ""
+    names = "".join(f"<th{mark}>{html.escape(name)}</th>" for name in head)
+    body = "".join(
+        f"<tr{' class=best' if best else ''}>{''.join(field.html() for field in fields)}</tr>" for fields, best in rows
+    )
+    return f"<div class=wide><table><thead><tr>{names}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def returns_table(cells: Sequence[Mapping[str, Any]]) -> str:
+    """
+    :param cells: as aggregated
+    :return: HTML: a row for each algorithm in each cell, the best of a cell in bold
+    """
+    head = ["task", "noise", "algorithm", "mean at the end", "95% interval", "each seed", "mean of the curve", "guider"]
+    head += ["KL / target", "steps to the reference's end"]
+    best = _best(cells)
+    rows = [(list(_returns(cell)), id(cell) in best) for cell in cells]
+    shown = [column for column in range(len(head)) if any(fields[column].text for fields, _ in rows)]
+    return table(
+        [head[column] for column in shown], [([fields[column] for column in shown], is_best) for fields, is_best in rows]
+    )
+
+
+def _best(cells: Sequence[Mapping[str, Any]]) -> set[int]:
+    by_cell: dict[Any, list[Mapping[str, Any]]] = {}
+    for cell in cells:
+        by_cell.setdefault((cell["task"], cell["noise"]), []).append(cell)
+    return {id(max(of_cell, key=lambda one: one["final_mean"])) for of_cell in by_cell.values() if len(of_cell) > 1}
+
+
+def _returns(cell: Mapping[str, Any]) -> Iterator[Field]:
+    yield Field(cell["task"])
+    yield number(cell["noise"], 2)
+    yield Field(
+        cell["algorithm"] + (f", after {cell['needed_steps']:,} steps of needed runs" if "needed_steps" in cell else "")
+    )
+    yield number(cell["final_mean"])
+    _, low, high = mean_interval(np.array(cell["final"], dtype=float))
+    yield Field("one seed" if math.isinf(low) else f"{low:,.0f} to {high:,.0f}")
+    yield Field(", ".join(f"{value:,.0f}" for value in cell["final"]))
+    yield number(cell["area_iqm"][0])
+    yield number(cell.get("guider_mean"))
+    yield number(cell.get("kl_over_target_mean"), 2)
+    yield number(cell["steps_to_reference"])
+
+
+def overall_table(results: Mapping[str, Any]) -> str:
+    """
+    :param results: as aggregated
+    :return: HTML: normalised returns over all cells, and how probably a run of the row's algorithm ends above one of the
+        column's
+    """
+    names = sorted(results["normalised_iqm"], key=lambda name: -results["normalised_iqm"][name][0])
+    head = ["algorithm", "normalised IQM", "95% interval", *(f"above {name}" for name in names)]
+    rows = []
+    for name in names:
+        value, low, high = results["normalised_iqm"][name]
+        others = [_improvement(results["probability_of_improvement"].get(f"{name} over {other}")) for other in names]
+        rows.append(([Field(name), number(value, 2), Field(f"{low:.2f} to {high:.2f}"), *others], name == names[0]))
+    return table(head, rows)
+
+
+def _improvement(estimate: Sequence[float] | None) -> Field:
+    if estimate is None:
+        return Field("", -math.inf)
+    value, low, high = estimate
+    return Field(f"{value:.2f} [{low:.2f}, {high:.2f}]", value)
+
+
+def differences_table(arguments: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict[str, Any]]:
+    """
+    :param arguments: kind of run, such as "gac, Hopper, noise 0.1" -> the algorithm's arguments
+    :return: HTML: the arguments in which algorithms differ, each algorithm's first cell; and those that all share
+    """
+    flat: dict[str, dict[str, Any]] = {}
+    for kind, of_kind in arguments.items():
+        flat.setdefault(kind.split(", ")[0], dict(_flat(of_kind)))
+    names = list(dict.fromkeys(name for of_algorithm in flat.values() for name in of_algorithm))
+    shared = {name: next(iter(flat.values()))[name] for name in names if _is_shared(name, list(flat.values()))}
+    rows = [
+        ([Field(name), *(Field(_in_words(of_algorithm.get(name, ""))) for of_algorithm in flat.values())], False)
+        for name in names
+        if name not in shared
+    ]
+    return table(["argument", *flat], rows, sortable=False) if rows else "<p>They have the same arguments.</p>", shared
+
+
+def _flat(arguments: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in arguments.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}", value
+
+
+def _is_shared(name: str, arguments: Sequence[Mapping[str, Any]]) -> bool:
+    return all(name in one and one[name] == arguments[0].get(name) for one in arguments)
+
+
+def _in_words(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
