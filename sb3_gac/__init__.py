@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from sb3_gac.baselines.tgrl import TGRL
     from sb3_gac.checkpoint.files import CheckpointError
     from sb3_gac.checks.divergence import DivergenceError
-    from sb3_gac.checks.environments import EnvironmentFailedError, InvalidStepError
+    from sb3_gac.checks.environments import EnvironmentFailedError
+    from sb3_gac.checks.observations import InvalidStepError
     from sb3_gac.deploy.export import export_learner
     from sb3_gac.deploy.normalization import DeploymentNormalizer
     from sb3_gac.gac.ablations import GACShare, GACWithoutQ
@@ -53,7 +54,7 @@ _WHERE = {
     "ExactCheckpointCallback": "sb3_gac.base.checkpoint_callback",
     "GACPolicy": "sb3_gac.gac.policies",
     "GuiderLearnerEvalCallback": "sb3_gac.base.callbacks",
-    "InvalidStepError": "sb3_gac.checks.environments",
+    "InvalidStepError": "sb3_gac.checks.observations",
     "OnnxPolicy": "sb3_gac.learner",
     "SeededEvalCallback": "sb3_gac.base.callbacks",
     "export_learner": "sb3_gac.deploy.export",

@@ -3,27 +3,30 @@
 import traceback
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
 
+from sb3_gac.checks.observations import (
+    GO_ON,
+    REWARD,
+    InvalidStepError,
+    check_entries,
+    check_observation,
+    check_rows,
+    entries_in,
+)
 from sb3_gac.checks.processes import KEPT, WatchedPipe, end_processes
 from sb3_gac.checks.uses import FINAL, EnvironmentUse, KeepingFinal, SuspiciousEnds
-from sb3_gac.checks.values import described, entries_of, fault_of, index_bounds, is_finite
+from sb3_gac.checks.values import described, entries_of
 
-GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
 GUARD = "_environment_guard"
 TRUNCATED = "TimeLimit.truncated"  # SB3's name of an end by time limit in an info
 RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under FINAL
 REWARD_IS_TAKEN = (DummyVecEnv.step_wait.__code__, Monitor.step.__code__)  # by SB3, which makes a number of it
 NO_NUMBER = ("0-dimensional arrays", "size-1 arrays", "array element with a sequence", "float() argument")  # so numpy says it
-
-
-class InvalidStepError(ValueError):
-    """An observation, a reward or an action does not fit its space or is not finite."""
 
 
 class EnvironmentFailedError(RuntimeError):
@@ -137,7 +140,7 @@ class EnvironmentGuard:
             rewards, dones = np.array(rewards), np.array(dones)
         check_observation(observation, self._entries)
         self._check_number(rewards, dones, infos)
-        _check_rows('The "reward"', rewards, REWARD)
+        check_rows('The "reward"', rewards, REWARD)
         self._check_ends(observation, dones, infos)
         return observation, rewards, dones, infos
 
@@ -153,7 +156,7 @@ class EnvironmentGuard:
         for key, entry in self._base_entries.items():
             value = entries.get(key)
             if not (isinstance(value, np.ndarray) and value.shape == entry.shape and value.dtype == entry.dtype):
-                _check_entries(entries, {key: entry}, index)
+                check_entries(entries, {key: entry}, index)
         self._save_obs(index, observation)
 
     def close(self) -> None:
@@ -185,7 +188,7 @@ class EnvironmentGuard:
                         "for the observation returned with it is the next episode's first. SB3's VecEnv has an episode's last "
                         f'observation in infos[i]["{FINAL}"]: put it there before the environment is reset; {GO_ON}.'
                     )
-                _check_entries(info[FINAL], self._entries, index, "The last observation's entry")
+                check_entries(info[FINAL], self._entries, index, "The last observation's entry")
                 info[RAW_FINAL] = info[FINAL]
             elif (FINAL in info or info.get(TRUNCATED)) and not _is_of_another(info, index, dones, infos):
                 for key in (FINAL, TRUNCATED, RAW_FINAL):  # left from an earlier end, in a dict that is used again
@@ -233,111 +236,10 @@ class EnvironmentGuard:
             if frame.f_code.co_name == "_stack_obs":
                 for number, observation in enumerate(frame.f_locals["obs_list"]):
                     try:
-                        _check_entries(observation, self._base_entries, number)
+                        check_entries(observation, self._base_entries, number)
                     except InvalidStepError as fault:
                         return fault
         return None
-
-
-class Entry(NamedTuple):
-    """
-    What is to be known of an entry in every step.
-
-    :param space: of one environment's
-    :param shape: of that space
-    :param dtype: of that space
-    :param bounds: see :func:`index_bounds`
-    """
-
-    space: spaces.Space
-    shape: tuple[int, ...] | None
-    dtype: Any
-    bounds: tuple[Any, Any] | None
-
-    @classmethod
-    def of(cls, space: spaces.Space) -> "Entry":
-        """
-        :param space: of one environment's
-        """
-        return cls(space, space.shape, space.dtype, index_bounds(space))
-
-
-REWARD = Entry.of(spaces.Box(-np.inf, np.inf, (), np.float32))
-
-
-def entries_in(space: spaces.Space) -> dict[str, Entry]:
-    """Those of an observation's entries that are single arrays."""
-    entries = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-    return {key: Entry.of(entry) for key, entry in entries.items() if entry.shape is not None}
-
-
-def check_observation(observation: Any, expected: dict[str, Entry]) -> None:
-    """
-    One look at each entry of all environments together.
-
-    :param observation: of all environments
-    :param expected: its entries
-    :raises InvalidStepError: naming the entry and the environment
-    """
-    entries = entries_of(observation)
-    for key, entry in expected.items():
-        if key not in entries:
-            raise InvalidStepError(
-                f'The observation\'s entry "{key}" is missing, of all environments; nothing was stored. They returned '
-                f"{list(entries)}. Check the wrappers around them; {GO_ON}."
-            )
-        _check_rows(f'The observation\'s entry "{key}"', entries[key], entry)
-
-
-def _check_entries(observation: Any, expected: dict[str, Entry], index: int, what: str = "The observation's entry") -> None:
-    """
-    :param observation: of one environment
-    :param expected: its entries
-    :param index: of the environment
-    :param what: the entries' kind, for the message
-    :raises InvalidStepError: naming the entry and the environment
-    """
-    entries = entries_of(observation)
-    for key, entry in expected.items():
-        fault = fault_of(entries[key], entry.space) if key in entries else "is missing"
-        if fault is not None:
-            raise InvalidStepError(_message(f'{what} "{key}"', index, fault))
-
-
-def _check_rows(name: str, rows: Any, entry: Entry) -> None:
-    """
-    One look at all environments together; at each by itself only if something may be wrong.
-
-    :param name: for the message
-    :param rows: one for each environment
-    :param entry: what each is to be
-    :raises InvalidStepError: naming the environment
-    """
-    bounds = entry.bounds
-    if (
-        isinstance(rows, np.ndarray)
-        and rows.shape[1:] == entry.shape
-        and _comes_in(rows.dtype, entry.dtype)
-        and is_finite(rows, entry.dtype)
-        and (bounds is None or ((rows >= bounds[0]) & (rows <= bounds[1])).all())
-    ):
-        return
-    for index, row in enumerate(rows):
-        fault = fault_of(row, entry.space)
-        if fault is not None:
-            raise InvalidStepError(_message(name, index, fault))
-
-
-def _comes_in(given: Any, expected: Any) -> bool:
-    """Whether the type is the expected one, or one whose numbers a floating-point entry takes as they are."""
-    return given == expected or (expected.kind == "f" and given.kind in "biuf")
-
-
-def _message(name: str, index: int, fault: str) -> str:
-    return (
-        f"{name} of environment {index} {fault}; it was not stored. Check the environment's simulation and its wrappers; "
-        f"{GO_ON}."
-    )
 
 
 def _is_of_another(info: dict[str, Any], index: int, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> bool:

@@ -15,7 +15,8 @@ from stable_baselines3.common.vec_env import (
     unwrap_vec_normalize,
 )
 
-from sb3_gac.checks.environments import FINAL, RAW_FINAL, InvalidStepError, check_observation, entries_in
+from sb3_gac.checks.environments import FINAL, RAW_FINAL
+from sb3_gac.checks.observations import InvalidStepError, check_observation, entries_in
 
 Entries = dict[str, np.ndarray]
 #: Wrappers that hand on observations as they are

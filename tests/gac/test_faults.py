@@ -192,7 +192,7 @@ def test_a_guard_is_not_seen_by_what_compares_environments():
 
 def test_an_environment_is_guarded_once(monkeypatch):
     calls = []
-    monkeypatch.setattr("sb3_gac.checks.environments.is_finite", lambda *args: calls.append(args) or True)
+    monkeypatch.setattr("sb3_gac.checks.observations.is_finite", lambda *args: calls.append(args) or True)
     env = VecNormalize(DummyVecEnv([TwoViewBandit] * 3))
     for _ in range(3):
         model = small_model(env, learning_starts=1000)
