@@ -21,6 +21,7 @@ if find_spec("gymnasium") is not None:
 if TYPE_CHECKING:
     from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
     from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
+    from sb3_gac.base.imitation import clone_behaviour, copy_networks, demonstrate
     from sb3_gac.base.recording import write_recording
     from sb3_gac.baselines.asymmetric_mpo import AsymmetricMPO
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
@@ -57,6 +58,9 @@ _WHERE = {
     "InvalidStepError": "sb3_gac.checks.observations",
     "OnnxPolicy": "sb3_gac.learner",
     "SeededEvalCallback": "sb3_gac.base.callbacks",
+    "clone_behaviour": "sb3_gac.base.imitation",
+    "copy_networks": "sb3_gac.base.imitation",
+    "demonstrate": "sb3_gac.base.imitation",
     "export_learner": "sb3_gac.deploy.export",
     "preset": "sb3_gac.presets",
     "write_recording": "sb3_gac.base.recording",
@@ -104,6 +108,9 @@ __all__ = [
     "OnnxPolicy",
     "SeededEvalCallback",
     "__version__",
+    "clone_behaviour",
+    "copy_networks",
+    "demonstrate",
     "envs",
     "export_learner",
     "preset",

@@ -1,0 +1,230 @@
+"""
+Where training starts from: what another policy does, cloned by the deployed one, or another model's networks.
+
+Behaviour cloning (Pomerleau 1991) and DAgger (Ross et al. 2011, arXiv 1011.0686)::
+
+    teacher = AsymmetricSAC.load("full_state")
+    shown = demonstrate(teacher, env, 20_000)
+    clone_behaviour(model, shown)
+    for _ in range(3):  # what the student meets, as the teacher would have acted there
+        shown = shown + demonstrate(teacher, env, 5_000, student=model)
+        clone_behaviour(model, shown)
+    model.learn(100_000)
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
+
+from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.checks.values import check_integer, check_positive
+from sb3_gac.math.distributions import Categorical
+
+HELD_OUT = 0.1
+
+
+class Demonstrations(NamedTuple):
+    """
+    What a policy does. They add up; those of a file or of another program are made of its arrays.
+
+    :param observations: entry -> N of them, at least the entries that the student reads
+    :param actions: in the environment's range, shape (N, A), or numbers of actions, shape (N,)
+    """
+
+    observations: Mapping[str, np.ndarray]
+    actions: np.ndarray
+
+    def __add__(self, other: Any) -> "Demonstrations":
+        """All of both."""
+        keys = [key for key in self.observations if key in other.observations]
+        joined = {key: np.concatenate([self.observations[key], other.observations[key]]) for key in keys}
+        return Demonstrations(joined, np.concatenate([self.actions, other.actions]))
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.actions)
+
+
+def demonstrate(
+    teacher: BaseAlgorithm, env: VecEnv, n_steps: int, student: BaseAlgorithm | None = None, deterministic: bool = True
+) -> Demonstrations:
+    """
+    :param teacher: a trained model of this package or of SB3; of GAC and its like it is the guider that shows
+    :param env: to act in, from a reset on; it gives all entries that the teacher reads
+    :param n_steps: environment steps of all environments together, rounded up
+    :param student: who acts, while the teacher only says what it would have done (DAgger); by default the teacher acts
+    :param deterministic: whether the teacher shows its most likely action, instead of a sample
+    :return: what was observed, and the teacher's action for each
+    :raises ValueError: if ``n_steps`` is less than one
+    """
+    check_integer("n_steps", n_steps, 1)
+    show: Any = getattr(teacher, "predict_guider", teacher.predict)
+    seen: list[Mapping[str, np.ndarray]] = []
+    shown: list[np.ndarray] = []
+    observation: Any = env.reset()
+    state = own = None
+    start = np.ones(env.num_envs, dtype=bool)
+    for _ in range(-(-n_steps // env.num_envs)):
+        action, state = show(observation, state=state, episode_start=start, deterministic=deterministic)
+        seen.append({key: value.copy() for key, value in observation.items()})
+        shown.append(action)
+        if student is not None:
+            action, own = student.predict(observation, state=own, episode_start=start)
+        observation, _, start, _ = env.step(action)
+    return Demonstrations({key: np.concatenate([row[key] for row in seen]) for key in seen[0]}, np.concatenate(shown))
+
+
+def clone_behaviour(
+    model: BaseAlgorithm,
+    demonstrations: Demonstrations,
+    gradient_steps: int = 2_000,
+    batch_size: int = 256,
+    learning_rate: float = 1e-3,
+    seed: int = 0,
+) -> dict[str, float]:
+    """
+    Train a model's deployed policy to do as it was shown, before ``learn``: its most likely action by least squares, or the
+    choice's log-likelihood. A Gaussian's standard deviation, critics and the guider stay as they are, so a residual guider
+    starts at what was cloned. A tenth of the demonstrations is held out to tell how well it does.
+
+    Critics know nothing of the cloned policy at first. Its first gradient steps in ``learn`` may unlearn it: give critics time
+    by ``learning_starts`` and, where it can be, ``policy_delay``.
+
+    :param model: of this package, without a memory
+    :param demonstrations: to learn from, see :func:`demonstrate`
+    :param gradient_steps: of Adam
+    :param batch_size: of each of them
+    :param learning_rate: of Adam
+    :param seed: of what is held out, and of the batches
+    :return: "before" and "after": the mean squared error of actions in [-1, 1], or the share of other choices, on what was
+        held out
+    :raises TypeError: if the model is of another kind
+    :raises ValueError: if the policy has a memory, or demonstrations do not fit it
+    """
+    check_integer("gradient_steps", gradient_steps, 1)
+    check_integer("batch_size", batch_size, 1)
+    check_positive("learning_rate", learning_rate)
+    policy = model.policy
+    if not isinstance(policy, AsymmetricPolicy):
+        raise TypeError(f"model must be of sb3_gac, got {type(model).__name__}.")
+    if policy.deployed.memory is not None:
+        raise ValueError("model has a memory, and demonstrations are single observations: clone a policy without one.")
+    observations, actions = _as_tensors(policy, demonstrations)
+    order = th.from_numpy(np.random.RandomState(seed).permutation(len(actions))).to(policy.device)
+    held = max(int(HELD_OUT * len(actions)), 1)
+    test, train = order[:held], order[held:]
+    before = _error(policy, observations, actions, test)
+    random = np.random.RandomState(seed + 1)
+    optimizer = th.optim.Adam(_cloned_parameters(policy), lr=learning_rate)
+    policy.deployed.train(True)
+    for _ in range(gradient_steps):
+        rows = train[th.from_numpy(random.randint(len(train), size=batch_size)).to(policy.device)]
+        loss = _loss(policy, {key: value[rows] for key, value in observations.items()}, actions[rows])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    policy.deployed.train(False)
+    optimizer.zero_grad()
+    return {"before": before, "after": _error(policy, observations, actions, test)}
+
+
+def copy_networks(model: BaseAlgorithm, source: BaseAlgorithm, networks: Mapping[str, str]) -> None:
+    """
+    Start from what another model has learned: its networks' parameters in place of a model's own, targets included.
+
+    :param model: of this package
+    :param source: likewise, with networks of the same sizes on the same entries
+    :param networks: network of ``model`` -> network of ``source``, such as ``{"guider": "actor"}``
+    :raises ValueError: if there is no such network, or its parameters are of other shapes
+    """
+    for name, from_name in networks.items():
+        own, other = (_network(one, role) for one, role in ((model, name), (source, from_name)))
+        saved, expected = other.state_dict(), own.state_dict()
+        differ = [key for key in {**expected, **saved} if _shape(saved, key) != _shape(expected, key)]
+        if differ:
+            key = differ[0]
+            raise ValueError(
+                f'networks: "{from_name}" of {type(source).__name__} does not fit "{name}" of {type(model).__name__}: {key} '
+                f"is {_shape(saved, key)} there, and {_shape(expected, key)} here. Make both with one net_arch, on the same "
+                "entries."
+            )
+    for name, from_name in networks.items():
+        parameters = _network(source, from_name).state_dict()
+        _network(model, name).load_state_dict(parameters)
+        target = getattr(model.policy, f"{name}_target", None)
+        if target is not None:
+            target.load_state_dict(parameters)
+
+
+def _network(model: BaseAlgorithm, name: str) -> nn.Module:
+    policy = model.policy
+    roles = list(policy.roles.all) if isinstance(policy, AsymmetricPolicy) else []
+    network = getattr(policy, name, None) if name in roles else None
+    if network is None:
+        raise ValueError(f"networks: {type(model).__name__} has no network {name!r}; it has {roles}.")
+    return network
+
+
+def _shape(state: Mapping[str, th.Tensor], key: str) -> tuple[int, ...] | str:
+    return tuple(state[key].shape) if key in state else "missing"
+
+
+def _as_tensors(policy: AsymmetricPolicy, demonstrations: Demonstrations) -> tuple[dict[str, th.Tensor], th.Tensor]:
+    """Entries that the deployed policy reads, and actions as it computes them."""
+    if len(demonstrations) < 2:
+        raise ValueError(f"demonstrations must be at least two, got {len(demonstrations)}.")
+    keys = policy.role_keys[policy.roles.deployed]
+    missing = [key for key in keys if key not in demonstrations.observations]
+    if missing:
+        raise ValueError(
+            f"demonstrations lack the entries {missing}, which the deployed policy reads; they have "
+            f"{list(demonstrations.observations)}."
+        )
+    observations, _ = policy.deployed.reader.read({key: demonstrations.observations[key] for key in keys}, policy.device)
+    space = policy.action_space
+    count = len(next(iter(observations.values())))
+    actions = np.asarray(demonstrations.actions).reshape(len(demonstrations), -1)
+    if count != len(actions):
+        raise ValueError(f"demonstrations have {count} observations and {len(actions)} actions: there must be one for each.")
+    outside = [index for index, action in enumerate(actions) if not _is_action(space, action)]
+    if outside:
+        raise ValueError(f"demonstrations: action {outside[0]} is {actions[outside[0]]}, which is not in {space}.")
+    if isinstance(space, spaces.Box):
+        actions = policy.scale_action(actions.reshape(-1, *space.shape)).reshape(count, -1)
+        return observations, th.as_tensor(actions, dtype=th.float32, device=policy.device)
+    return observations, th.as_tensor(actions[:, 0].astype(np.int64), device=policy.device)
+
+
+def _is_action(space: spaces.Space, action: np.ndarray) -> bool:
+    if isinstance(space, spaces.Box):
+        return action.size == int(np.prod(space.shape)) and space.contains(action.reshape(space.shape).astype(space.dtype))
+    return action.size == 1 and space.contains(int(action[0]))
+
+
+def _cloned_parameters(policy: AsymmetricPolicy) -> list[nn.Parameter]:
+    """Those of the deployed network that its action depends on, a Gaussian's standard deviation not."""
+    kept = {id(parameter) for parameter in policy.deployed.head.deployment_parameters()}
+    return [one for one in policy.deployed.parameters() if one.requires_grad and id(one) not in kept]
+
+
+def _loss(policy: AsymmetricPolicy, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+    """Cross-entropy of a choice, or the squared distance of the most likely action in [-1, 1]."""
+    distribution = policy.deployed.distribution(observations)
+    if isinstance(distribution, Categorical):
+        return nn.functional.cross_entropy(distribution.logits, actions)
+    return nn.functional.mse_loss(distribution.mode, actions)
+
+
+@th.no_grad()
+def _error(policy: AsymmetricPolicy, observations: dict[str, th.Tensor], actions: th.Tensor, rows: th.Tensor) -> float:
+    distribution = policy.deployed.distribution({key: value[rows] for key, value in observations.items()})
+    if isinstance(distribution, Categorical):
+        return float((distribution.logits.argmax(-1) != actions[rows]).float().mean())
+    return float(nn.functional.mse_loss(distribution.mode, actions[rows]))
