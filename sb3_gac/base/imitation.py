@@ -122,7 +122,7 @@ def clone_behaviour(
     test, train = order[:held], order[held:]
     before = _error(policy, observations, actions, test)
     random = np.random.RandomState(seed + 1)
-    optimizer = th.optim.Adam(_cloned_parameters(policy), lr=learning_rate)
+    optimizer = th.optim.Adam([one for one in policy.deployed.parameters() if one.requires_grad], lr=learning_rate)
     policy.deployed.train(True)
     for _ in range(gradient_steps):
         rows = train[th.from_numpy(random.randint(len(train), size=batch_size)).to(policy.device)]
@@ -206,12 +206,6 @@ def _is_action(space: spaces.Space, action: np.ndarray) -> bool:
     if isinstance(space, spaces.Box):
         return action.size == int(np.prod(space.shape)) and space.contains(action.reshape(space.shape).astype(space.dtype))
     return action.size == 1 and space.contains(int(action[0]))
-
-
-def _cloned_parameters(policy: AsymmetricPolicy) -> list[nn.Parameter]:
-    """Those of the deployed network that its action depends on, a Gaussian's standard deviation not."""
-    kept = {id(parameter) for parameter in policy.deployed.head.deployment_parameters()}
-    return [one for one in policy.deployed.parameters() if one.requires_grad and id(one) not in kept]
 
 
 def _loss(policy: AsymmetricPolicy, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
