@@ -16,6 +16,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Sequence
+from ctypes.util import find_library
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -264,7 +265,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = parse_arguments(arguments)
-    if options.video is not None and sys.platform == "linux" and "DISPLAY" not in os.environ:
+    if options.video is not None and "DISPLAY" not in os.environ and find_library("EGL") is not None:
         os.environ.setdefault("MUJOCO_GL", "egl")  # which MuJoCo reads when it is first imported
     try:
         evaluation = Evaluation(options)

@@ -54,6 +54,11 @@ def noisy_walk(noise_std=0.2, history=1, **kwargs):
     return env if history == 1 else History(env, history, actions=True)
 
 
+def blind_walk():
+    """That nobody can draw."""
+    return Walk()
+
+
 class Remembering(EvaluatedPolicy):
     """Moves against the mean of the positions that it has seen in the episode."""
 
