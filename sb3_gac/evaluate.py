@@ -17,6 +17,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from ctypes.util import find_library
+from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -108,7 +109,7 @@ def environment_for(options: argparse.Namespace, file: Path) -> Environment:
             'with its arguments, such as --env sb3_gac/HalfCheetah-v5 --env-kwargs "{history: 4}".'
         )
     recorded = environment_of_run(file.parent)
-    return Environment(recorded.env_id, {**recorded.kwargs, **options.env_kwargs})
+    return replace(recorded, kwargs={**recorded.kwargs, **options.env_kwargs})
 
 
 def policies_of(options: argparse.Namespace, file: Path, env: gym.Env) -> tuple[str, dict[str, EvaluatedPolicy]]:
@@ -212,7 +213,7 @@ class Evaluation:
             "versions": versions(),
             "model": str(self.file),
             "algorithm": self.algorithm,
-            "environment": {"id": self.environment.env_id, "kwargs": dict(self.environment.kwargs)},
+            "environment": asdict(self.environment),
             "trained": self.trained._asdict(),
             "first_and_last_seed": seeds,
         }

@@ -69,10 +69,12 @@ class Environment:
 
     :param env_id: of gymnasium, ``module:id`` of one that a module registers, or ``module:name`` of a class or function
     :param kwargs: keyword arguments of it
+    :param wrappers: around it, from the inside to the outside, each ``module:Class`` and its keyword arguments
     """
 
     env_id: str
     kwargs: Mapping[str, Any] = field(default_factory=dict)
+    wrappers: Sequence[Mapping[str, Mapping[str, Any]]] = ()
 
     def make(self, setting: Setting, render_mode: str | None = None) -> gym.Env:
         """
@@ -84,6 +86,8 @@ class Environment:
         own = {name: value for name, value in values.items() if name in self._parameters}
         rendering = {} if render_mode is None else {"render_mode": render_mode}
         env = self._creator(**{**self.kwargs, **own, **rendering})
+        for path, arguments in (item for wrapper in self.wrappers for item in wrapper.items()):
+            env = import_path(path)(env, **arguments)
         entries = getattr(env.observation_space, "spaces", {})
         if PARTIAL not in entries:
             raise ValueError(f'{self.env_id} has no entry "{PARTIAL}" in its observations: {env.observation_space}.')
@@ -153,6 +157,9 @@ def environment_of_run(directory: Path) -> Environment:
     :return: the environment that it was trained in
     """
     run = yaml.safe_load((directory / CONFIGURATION).read_text())
+    if "environment" in run:
+        made = run["environment"]
+        return Environment(made["id"], made["kwargs"], made.get("wrappers", ()))
     kwargs = {"noise_std": run["noise"]}
     if run.get("history", 1) != 1:
         kwargs["history"] = run["history"]

@@ -2,6 +2,8 @@
 
 import json
 import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, export_learner
-from sb3_gac.evaluate import main
+from sb3_gac.evaluate import main, parse_arguments
 from sb3_gac.evaluation.episodes import Episode, run_episodes
 from sb3_gac.evaluation.figure import draw
 from sb3_gac.evaluation.policies import guider_of, learner_of
@@ -45,7 +47,7 @@ def test_a_model_is_evaluated_with_its_guider_in_every_setting(gac, tmp_path, ca
     ]
     assert found["command"].startswith(f"python -m sb3_gac.evaluate {gac}")
     assert found["first_and_last_seed"] == [5, 7]
-    assert found["environment"] == {"id": NOISY[1], "kwargs": {"history": 2}}
+    assert found["environment"] == {"env_id": NOISY[1], "kwargs": {"history": 2}, "wrappers": []}
     assert {"sb3_gac", "torch", "numpy"} <= set(found["versions"])
     out = capsys.readouterr().out
     assert "The learner reads partial. The guider reads partial and privileged." in out
@@ -89,20 +91,12 @@ def test_the_learner_gets_nothing_that_is_privileged(gac, tmp_path, monkeypatch)
     assert all(keys == {"partial"} for keys in seen)
 
 
-def test_exported_files_do_as_the_model_does(gac, tmp_path):
-    pytest.importorskip("onnxruntime", reason="runs the exported file")
-    pytest.importorskip("onnx", reason="writes the exported file")
-    model = GAC.load(gac)
-    files = [gac, *(export_learner(model, tmp_path / f"x{suffix}", verify_on=8) for suffix in (".onnx", ".pt"))]
-    found = [_evaluate(file, tmp_path, *NOISY, "--drop", "0", "0.5")["results"] for file in files]
-    for of_file in found[1:]:
-        for result, expected in zip(of_file, found[0], strict=True):
-            np.testing.assert_allclose(result["returns"], expected["returns"], rtol=1e-3)
-
-
 @pytest.mark.parametrize("suffix", [".onnx", ".pt"])
-def test_exported_memories_begin_anew_with_each_episode(suffix, tmp_path):
-    pytest.importorskip("onnxruntime", reason="runs the exported file")
+def test_exported_files_do_as_the_model_and_begin_anew_with_each_episode(suffix, tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_gac.evaluate.SIDE_BY_SIDE", 1)
+    if suffix == ".onnx":
+        pytest.importorskip("onnx", reason="writes the exported file")
+        pytest.importorskip("onnxruntime", reason="runs the exported file")
     memory = {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8]}
     model = GAC("MultiInputGruPolicy", Walk(), **{**SMALL, "policy_kwargs": memory})
     model.save(tmp_path / "gru")
@@ -188,6 +182,24 @@ def test_the_option_that_is_wrong_is_named(options, capsys):
     with pytest.raises(SystemExit):
         main(["model.zip", *options])
     assert f"{options[0]}: " in capsys.readouterr().err
+
+
+PAGE = (Path(__file__).parents[2] / "docs/evaluation.md").read_text()
+
+
+def test_the_pages_commands_and_code_are_right():
+    commands = re.findall(r"^(?:sb3-gac evaluate|python -m sb3_gac.evaluate) (.*)$", PAGE, re.MULTILINE)
+    assert len(commands) == 2
+    for command in commands:
+        parse_arguments(shlex.split(command))
+    names = {}
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    first, second = code.split("\n\nenv = gymnasium.make(")
+    for block in (first, f"import gymnasium\nenv = gymnasium.make({second}"):
+        exec(block, names)
+        assert names["env"].reset(seed=0)[0] in names["env"].observation_space
+    for option in ("--noise", "--delay", "--drop", "--guider", "--env", "--vec-normalize", "--out", "--seed", "--video"):
+        assert f"`{option}" in PAGE
 
 
 # --- numbers ---------------------------------------------------------------------------------------------------------

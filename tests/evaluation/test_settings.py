@@ -87,6 +87,13 @@ def test_a_runs_configuration_says_where_it_was_trained(tmp_path):
     assert environment_of_run(tmp_path) == expected
     (tmp_path / "config.yaml").write_text(yaml.safe_dump({"task": "Hopper", "noise": 0.2}))
     assert environment_of_run(tmp_path) == Environment("sb3_gac/Hopper-v5", {"noise_std": 0.2})
+    wrappers = [{"sb3_gac.envs:History": {"length": 3}}]
+    run = {"task": None, "noise": None, "environment": {"id": ENV, "kwargs": {}, "wrappers": wrappers}}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(run))
+    environment = environment_of_run(tmp_path)
+    assert environment == Environment(ENV, {}, wrappers)
+    kinds = [type(layer) for layer in _disturbances(environment.make(Setting(0.1, 1)))]
+    assert kinds == [History, SensorDelay, SensorNoise]
 
 
 def test_what_the_policy_reads_must_be_shown():
