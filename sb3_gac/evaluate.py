@@ -38,7 +38,7 @@ from sb3_gac.evaluation.policies import (
     load_exported,
     normalizer_of,
 )
-from sb3_gac.evaluation.results import HEADER, LEGEND, Outcome, outcome, row
+from sb3_gac.evaluation.results import HEADER, LEGEND, Outcome, header_of, outcome, row
 from sb3_gac.evaluation.settings import (
     CONFIGURATION,
     DEFAULTS,
@@ -55,7 +55,7 @@ from sb3_gac.version import __version__
 
 EVAL_SEED = 10_000
 SIDE_BY_SIDE = 10  # environments: more save little, since they are stepped one after the other
-WIDTHS = (5, 5, 5, 7, 8, 7, 20, 5, 28, 7)  # of the table's columns, before its cells are known
+WIDTHS = (5, 5, 5, 7, 7, 6, 18, 5, 25, 7)  # of the table's columns, before its cells are known
 PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
 
 
@@ -159,6 +159,7 @@ class Evaluation:
             self._drawable(UNDISTURBED, check=True).close()
         self.directory = options.out or self.file.parent / "evaluation"
         self.outcomes: dict[Setting, dict[str, Outcome]] = {}
+        self.header: Sequence[str] = HEADER
 
     def run(self) -> None:
         """Evaluate, and print the table as it grows."""
@@ -171,11 +172,16 @@ class Evaluation:
             self.outcomes[setting] = {}
             for name, policy in self.policies.items():
                 episodes = self._episodes(policy, setting)
+                if not undisturbed:
+                    self.header = header_of(episodes)
+                    print(f"\n{_cells(self.header)}\n{_cells(['-' * width for width in WIDTHS[: len(self.header)]])}")
                 found = outcome(episodes, undisturbed.setdefault(name, episodes))
                 self.outcomes[setting][name] = found
-                above = "" if setting != UNDISTURBED or name != "learner" else f"\n{_cells(HEADER)}\n{_RULE}\n"
-                print(above + _cells(row(setting, name, found)), flush=True)
+                print(_cells(self._row(setting, name, found)), flush=True)
         print(f"{LEGEND}\n")
+
+    def _row(self, setting: Setting, name: str, found: Outcome) -> list[str]:
+        return row(setting, name, found)[: len(self.header)]
 
     def _episodes(self, policy: EvaluatedPolicy, setting: Setting) -> list[Episode]:
         count = self.options.episodes
@@ -197,8 +203,8 @@ class Evaluation:
         :param command: that made the results
         """
         self.directory.mkdir(parents=True, exist_ok=True)
-        lines = [row(setting, name, found) for setting, name, found in self._all()]
-        (self.directory / "evaluation.md").write_text(f"{self.title}\n\n{in_columns(HEADER, lines)}\n\n{LEGEND}\n")
+        lines = [self._row(*of) for of in self._all()]
+        (self.directory / "evaluation.md").write_text(f"{self.title}\n\n{in_columns(self.header, lines)}\n\n{LEGEND}\n")
         draw(self.outcomes, self.curves, self.trained, self.title, self.directory / "evaluation.png")
         results = [{**setting._asdict(), "policy": name, **found.as_json()} for setting, name, found in self._all()]
         (self.directory / "evaluation.json").write_text(json.dumps({**self._origin(command), "results": results}, indent=1))
@@ -241,10 +247,7 @@ class Evaluation:
 
 
 def _cells(texts: Sequence[str]) -> str:
-    return "| " + " | ".join(text.ljust(width) for text, width in zip(texts, WIDTHS, strict=True)) + " |"
-
-
-_RULE = _cells(["-" * width for width in WIDTHS])
+    return "| " + " | ".join(text.ljust(width) for text, width in zip(texts, WIDTHS, strict=False)) + " |"
 
 
 def versions() -> dict[str, str]:
@@ -272,7 +275,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         evaluation = Evaluation(options)
     except (ValueError, FileNotFoundError, ImportError, RuntimeError, gym.error.Error) as error:
         sys.exit(str(error))
-    evaluation.run()
+    try:
+        evaluation.run()
+    except KeyboardInterrupt:
+        print("\nStopped: nothing was saved.", file=sys.stderr)
+        sys.exit(130)
     evaluation.save(shlex.join(["python", "-m", "sb3_gac.evaluate", *arguments]))
     print(f"Saved in {evaluation.directory}: evaluation.md, evaluation.png, evaluation.json.")
     if options.video is not None:

@@ -89,6 +89,14 @@ def outcomes(results: Results) -> dict[Setting, dict[str, Outcome]]:
     }
 
 
+def header_of(episodes: Sequence[Episode]) -> tuple[str, ...]:
+    """
+    :param episodes: of any setting
+    :return: names of the columns; successes are the last one, and left out where the environment does not report them
+    """
+    return HEADER if all(episode.success is not None for episode in episodes) else HEADER[:-1]
+
+
 def row(setting: Setting, policy: str, found: Outcome) -> list[str]:
     """
     :param setting: of the sensor

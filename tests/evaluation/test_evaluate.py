@@ -5,19 +5,24 @@ import re
 import shlex
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, export_learner
+from sb3_gac.algorithms import ALGORITHMS, algorithm_class
+from sb3_gac.base.loading import load_model
 from sb3_gac.evaluate import main, parse_arguments
 from sb3_gac.evaluation.episodes import Episode, run_episodes
 from sb3_gac.evaluation.figure import draw
 from sb3_gac.evaluation.policies import guider_of, learner_of
-from sb3_gac.evaluation.results import outcome, row
+from sb3_gac.evaluation.results import HEADER, outcome, row
 from sb3_gac.evaluation.settings import UNDISTURBED, Environment, Setting
 from tests.evaluation.helpers import ENV, Walk, noisy_walk
+from tests.helpers import small_model
+from tests.registry import make
 
 SMALL = {"buffer_size": 100, "policy_kwargs": {"net_arch": [8]}, "device": "cpu", "seed": 0}
 
@@ -52,6 +57,7 @@ def test_a_model_is_evaluated_with_its_guider_in_every_setting(gac, tmp_path, ca
     out = capsys.readouterr().out
     assert "The learner reads partial. The guider reads partial and privileged." in out
     printed, written = (_cells(text) for text in (out, table))
+    assert printed[0] == list(HEADER), "with successes, which the environment reports"
     assert len(printed) == len(found["results"]) + 1
     assert printed == written
 
@@ -125,7 +131,9 @@ def test_a_runs_directory_is_enough(tmp_path, capsys):
         None,
         None,
     ), "returns below 0"
-    assert str(run / "evaluation") in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert str(run / "evaluation") in out
+    assert _cells(out)[0] == list(HEADER[:-1]), "nobody reports successes"
 
 
 def test_the_statistics_of_vec_normalize_count(tmp_path):
@@ -175,6 +183,36 @@ def test_what_is_wrong_is_said_before_anything_is_run(gac, tmp_path, monkeypatch
     for arguments, message in wrong.items():
         with pytest.raises(SystemExit, match=message):
             main([*map(str, arguments)])
+
+
+def test_what_is_stopped_is_told_so(gac, tmp_path, monkeypatch, capsys):
+    def stopped(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sb3_gac.evaluate.run_episodes", stopped)
+    with pytest.raises(SystemExit) as end:
+        _evaluate(gac, tmp_path, *NOISY)
+    assert end.value.code == 130
+    assert "nothing was saved" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_models_of_all_algorithms_are_found_in_their_files(name, tmp_path):
+    make(name, Walk()).save(tmp_path / "model.zip")
+    model = load_model(tmp_path / "model.zip")
+    assert type(model) is algorithm_class(name)
+    policies = [learner_of(model), *([guider_of(model)] if hasattr(model, "predict_guider") else [])]
+    for policy in policies:
+        episodes = run_episodes(policy, [Walk()], range(2))
+        assert np.isfinite([episode.total for episode in episodes]).all()
+
+
+def test_choices_are_actions_too():
+    env = gym.make("sb3_gac/TigerDoor-v0")
+    model = small_model(env)
+    for policy in (learner_of(model), guider_of(model)):
+        (episode,) = run_episodes(policy, [env], [0])
+        assert episode.length >= 1
 
 
 @pytest.mark.parametrize("options", [["--episodes", "0"], ["--env-kwargs", "4"], ["--delay", "0.5"], ["--noise"]])
