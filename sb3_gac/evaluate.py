@@ -54,6 +54,7 @@ from sb3_gac.evaluation.video import check_can_film, film
 from sb3_gac.version import __version__
 
 EVAL_SEED = 10_000
+STATISTICS = "vecnormalize.pkl"  # where rl_zoo3 and the benchmarks have them
 SIDE_BY_SIDE = 10  # environments: more save little, since they are stepped one after the other
 WIDTHS = (5, 5, 5, 7, 7, 6, 18, 5, 25, 7)  # of the table's columns, before its cells are known
 PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
@@ -64,7 +65,11 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     :param arguments: command line, by default the process's
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", type=Path, help="a run's directory, a model's zip, or an exported .onnx or .pt file")
+    parser.add_argument(
+        "model",
+        type=Path,
+        help="directory of a run, of train or of the benchmarks; a model's zip, or an exported .onnx or .pt file",
+    )
     for name, kind, text in (
         ("noise", float, "standard deviations of the sensor noise, in the units of partial"),
         ("delay", int, "steps by which observations are late"),
@@ -78,7 +83,12 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     parser.add_argument("--guider", action="store_true", help="evaluate the privileged policy too, on the same seeds")
     parser.add_argument("--env", metavar="ID", help="environment, by default that of the run; module:id and module:name too")
     parser.add_argument("--env-kwargs", default="{}", metavar="YAML", help='its arguments, such as "{history: 4}"')
-    parser.add_argument("--vec-normalize", type=Path, metavar="FILE", help="statistics of VecNormalize, as it saved them")
+    parser.add_argument(
+        "--vec-normalize",
+        type=Path,
+        metavar="FILE",
+        help=f"statistics of VecNormalize, as it saved them (default: {STATISTICS} beside the model)",
+    )
     parser.add_argument("--seed", type=int, default=EVAL_SEED, help=f"of the first episode (default: {EVAL_SEED})")
     parser.add_argument("--device", default="auto", help="to act on (default: auto)")
     parser.add_argument(
@@ -127,7 +137,9 @@ def policies_of(options: argparse.Namespace, file: Path, env: gym.Env) -> tuple[
             )
         return f"exported {file.suffix} file", {"learner": load_exported(file)}
     model = load_model(file, options.device)
-    normalize = normalizer_of(model, options.vec_normalize, env)
+    beside = file.parent / STATISTICS
+    found = beside if model.trained_normalised and beside.exists() else None
+    normalize = normalizer_of(model, options.vec_normalize or found, env)
     policies: dict[str, EvaluatedPolicy] = {"learner": learner_of(model, normalize)}
     if options.guider:
         policies["guider"] = guider_of(model, normalize)

@@ -153,18 +153,17 @@ def _of_batch(env_id: str) -> Mapping[str, inspect.Parameter]:
 
 def environment_of_run(directory: Path) -> Environment:
     """
-    :param directory: of a run of ``sb3_gac.train``
+    :param directory: of a run of ``sb3_gac.train``, or of the benchmarks
     :return: the environment that it was trained in
     """
-    run = yaml.safe_load((directory / CONFIGURATION).read_text())
-    if "environment" in run:
-        made = run["environment"]
+    configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
+    run = configuration.get("run", configuration)
+    made = run.get("environment")
+    if made is not None:
         return Environment(made["id"], made["kwargs"], made.get("wrappers", ()))
-    kwargs = {"noise_std": run["noise"]}
-    if run.get("history", 1) != 1:
-        kwargs["history"] = run["history"]
-    if run.get("privileged", "state") != "state":
-        kwargs["privileged"] = run["privileged"]
+    given = {"noise_std": run["noise"], "history": run.get("history"), "privileged": run.get("privileged")}
+    usual = {"history": 1, "privileged": "state"}  # which not every environment has as an argument
+    kwargs = {name: value for name, value in given.items() if value not in (None, usual.get(name))}
     return Environment(env_id_of(run["task"]), kwargs)
 
 

@@ -149,6 +149,8 @@ def test_the_statistics_of_vec_normalize_count(tmp_path):
         _evaluate(tmp_path / "normalised.zip", tmp_path, *options, "--vec-normalize", str(tmp_path / "none"))
     statistics = str(tmp_path / "statistics.pkl")
     found = _evaluate(tmp_path / "normalised", tmp_path, *options, "--vec-normalize", statistics, "--guider")
+    (tmp_path / "statistics.pkl").rename(tmp_path / "vecnormalize.pkl")
+    assert _evaluate(tmp_path / "normalised", tmp_path, *options, "--guider")["results"] == found["results"]
     env.training = False
     predictors = {"learner": model.predict, "guider": model.predict_guider}
     for result in found["results"]:

@@ -87,6 +87,9 @@ def test_a_runs_configuration_says_where_it_was_trained(tmp_path):
     assert environment_of_run(tmp_path) == expected
     (tmp_path / "config.yaml").write_text(yaml.safe_dump({"task": "Hopper", "noise": 0.2}))
     assert environment_of_run(tmp_path) == Environment("sb3_gac/Hopper-v5", {"noise_std": 0.2})
+    run = {"task": "Hopper", "noise": 0.0, "environment": None}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"run": run, "arguments": {}}))
+    assert environment_of_run(tmp_path) == Environment("sb3_gac/Hopper-v5", {"noise_std": 0.0}), "of a benchmark"
     wrappers = [{"sb3_gac.envs:History": {"length": 3}}]
     run = {"task": None, "noise": None, "environment": {"id": ENV, "kwargs": {}, "wrappers": wrappers}}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(run))
