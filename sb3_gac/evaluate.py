@@ -217,7 +217,8 @@ class Evaluation:
         self.directory.mkdir(parents=True, exist_ok=True)
         lines = [self._row(*of) for of in self._all()]
         (self.directory / "evaluation.md").write_text(f"{self.title}\n\n{in_columns(self.header, lines)}\n\n{LEGEND}\n")
-        draw(self.outcomes, self.curves, self.trained, self.title, self.directory / "evaluation.png")
+        labels = {name: f"{name} (reads {', '.join(policy.entries)})" for name, policy in self.policies.items()}
+        draw(self.outcomes, self.curves, self.trained, labels, self.title, self.directory / "evaluation.png")
         results = [{**setting._asdict(), "policy": name, **found.as_json()} for setting, name, found in self._all()]
         (self.directory / "evaluation.json").write_text(json.dumps({**self._origin(command), "results": results}, indent=1))
 

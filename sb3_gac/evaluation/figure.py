@@ -19,13 +19,13 @@ STYLES: dict[str, dict[str, Any]] = {
     "learner": {"color": "tab:blue", "marker": "o"},
     "guider": {"color": "tab:orange", "marker": "s", "linestyle": "--"},
 }
-NAMES = {"learner": "learner (partial alone)", "guider": "guider (with what is privileged)"}
 
 
 def draw(
     found: Mapping[Setting, Mapping[str, Outcome]],
     curves: Mapping[str, Sequence[Setting]],
     trained: Setting,
+    labels: Mapping[str, str],
     title: str,
     path: Path,
 ) -> None:
@@ -35,6 +35,7 @@ def draw(
     :param found: of all settings
     :param curves: what is varied -> settings, in the order of its values; if nothing is, all settings stand side by side
     :param trained: setting of training
+    :param labels: policy -> how the legend names it
     :param title: of the figure
     :param path: of the picture
     """
@@ -45,33 +46,33 @@ def draw(
     figure, axes = plt.subplots(1, panels, figsize=(2 + 4 * panels, 4.2), layout="constrained", sharey=True, squeeze=False)
     for axis, (name, settings) in zip(axes[0], curves.items(), strict=False):
         values = [getattr(setting, name) for setting in settings]
-        _draw_lines(axis, values, [found[setting] for setting in settings])
+        _draw_lines(axis, values, [found[setting] for setting in settings], labels)
         axis.axvline(getattr(trained, name), color="gray", linestyle=":", label="as in training")
         axis.set(xlabel=LABELS[name], xticks=values)
         axis.set_title(_held(name, settings[0]), fontsize="medium")
     if not curves:
-        _draw_points(axes[0, 0], found)
+        _draw_points(axes[0, 0], found, labels)
     axes[0, 0].set_ylabel("return, mean and its 95% interval")
     axes[0, 0].legend()
-    figure.suptitle(title)
+    figure.suptitle(title.replace(", ", "\n", 1))
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
 
-def _draw_lines(axis: Any, values: Sequence[float], found: Sequence[Mapping[str, Outcome]]) -> None:
+def _draw_lines(axis: Any, values: Sequence[float], found: Sequence[Mapping[str, Outcome]], labels: Mapping[str, str]) -> None:
     for policy in found[0]:
         means, lows, highs = np.array([of_policies[policy].mean for of_policies in found]).T
         style = STYLES[policy]
-        axis.plot(values, means, label=NAMES[policy], **style)
+        axis.plot(values, means, label=labels[policy], **style)
         if np.isfinite(lows).all():  # a single episode has no interval
             axis.fill_between(values, lows, highs, color=style["color"], alpha=0.2, linewidth=0)
 
 
-def _draw_points(axis: Any, found: Mapping[Setting, Mapping[str, Outcome]]) -> None:
+def _draw_points(axis: Any, found: Mapping[Setting, Mapping[str, Outcome]], labels: Mapping[str, str]) -> None:
     for shift, policy in zip((-0.06, 0.06), next(iter(found.values())), strict=False):
         means, lows, highs = np.array([of_policies[policy].mean for of_policies in found.values()]).T
         bars = [means - lows, highs - means] if np.isfinite(lows).all() else None
-        style = {**STYLES[policy], "linestyle": "none", "label": NAMES[policy]}
+        style = {**STYLES[policy], "linestyle": "none", "label": labels[policy]}
         axis.errorbar(np.arange(len(found)) + shift, means, bars, capsize=4, **style)
     axis.set(xticks=range(len(found)), xlim=(-0.5, len(found) - 0.5))
     axis.set_xticklabels([str(setting).replace(", ", "\n") for setting in found])

@@ -301,14 +301,14 @@ def test_the_curve_shows_what_was_found(tmp_path, monkeypatch):
         for setting in settings
         for name, base in [("learner", 5)]
     }
-    draw(found, {"noise": settings}, Setting(0.2), "title", tmp_path / "curve.png")
-    draw(found, {}, Setting(0.2), "title", tmp_path / "points.png")
+    draw(found, {"noise": settings}, Setting(0.2), {"learner": "pupil"}, "title", tmp_path / "curve.png")
+    draw(found, {}, Setting(0.2), {"learner": "pupil"}, "title", tmp_path / "points.png")
     (axis,) = kept[0].axes
     learner, trained = axis.get_lines()
     np.testing.assert_allclose(learner.get_xydata(), [[0, 6], [0.2, 4]])
     assert list(trained.get_xdata()) == [0.2, 0.2]
     assert axis.get_xlabel() == "standard deviation of the sensor noise"
-    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["learner (partial alone)", "as in training"]
+    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["pupil", "as in training"]
     assert axis.get_title() == "delay 0, drop 0"
     (points,) = kept[1].axes
     assert [label.get_text() for label in points.get_xticklabels()] == [
