@@ -15,7 +15,8 @@ import os
 import platform
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from ctypes.util import find_library
 from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch as th
 import yaml
 from tqdm import tqdm
 
@@ -289,14 +291,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (ValueError, FileNotFoundError, ImportError, RuntimeError, gym.error.Error) as error:
         sys.exit(str(error))
     try:
-        evaluation.run()
+        with one_thread():
+            evaluation.run()
+            evaluation.save(shlex.join(["python", "-m", "sb3_gac.evaluate", *arguments]))
+            print(f"Saved in {evaluation.directory}: evaluation.md, evaluation.png, evaluation.json.")
+            if options.video is not None:
+                print(evaluation.film_worst(options.video))
     except KeyboardInterrupt:
-        print("\nStopped: nothing was saved.", file=sys.stderr)
+        print("\nStopped.", file=sys.stderr)
         sys.exit(130)
-    evaluation.save(shlex.join(["python", "-m", "sb3_gac.evaluate", *arguments]))
-    print(f"Saved in {evaluation.directory}: evaluation.md, evaluation.png, evaluation.json.")
-    if options.video is not None:
-        print(evaluation.film_worst(options.video))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """A few rows at a time are too little work for several threads, which would wait for each other."""
+    before = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(before)
 
 
 if __name__ == "__main__":

@@ -195,7 +195,8 @@ def test_what_is_stopped_is_told_so(gac, tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as end:
         _evaluate(gac, tmp_path, *NOISY)
     assert end.value.code == 130
-    assert "nothing was saved" in capsys.readouterr().err
+    assert capsys.readouterr().err == "\nStopped.\n"
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
