@@ -210,7 +210,8 @@ class Evaluation:
     @property
     def title(self) -> str:
         """What is evaluated, and where."""
-        return f"{self.algorithm} on {self.environment.env_id}, {self.options.episodes} episodes for each setting"
+        count = self.options.episodes
+        return f"{self.algorithm} on {self.environment.env_id}, {count} episode{'s' * (count > 1)} for each setting"
 
     def save(self, command: str) -> None:
         """
