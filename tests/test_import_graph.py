@@ -20,6 +20,7 @@ ROOMS = {
     "checkpoint": "checkpoint|envs",
     "base": "algorithms|base|math|checks|schedules|optim|networks|replay|checkpoint|envs",
     "deploy": "deploy|base|checks|networks|envs|learner|version",
+    "evaluation": "evaluation|algorithms|base|envs|learner",
 }
 DRAWING = "page|intervals|bootstrap"
 FORBIDDEN = {
@@ -31,6 +32,8 @@ FORBIDDEN = {
         for name in BASELINES
         for pattern in ("{}.py", "{}/**/*.py")
     },
+    **{f"sb3_gac/{path}.py": r"mujoco\b" for path in ("evaluate", "evaluation/*")},  # before MUJOCO_GL is set
+    "sb3_gac/__main__.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac(?!\.version\b)",
     "sb3_gac/tabular/**/*.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac(?!\.tabular\b)",
     "sb3_gac/schedules.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "sb3_gac/algorithms.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",

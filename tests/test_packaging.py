@@ -22,6 +22,7 @@ PARTS = {  # extra -> what of it is needed, and what needs it
     "export": (["onnx"], EXPORT),
     "export, not onnx": (["onnxruntime"], EXPORT),
     "export, learner": (["onnxruntime"], "import sb3_gac.learner"),
+    "video": (["moviepy"], "from sb3_gac.evaluation.video import check_can_film; check_can_film(None, 'x')"),
     "popgym": (["popgym"], "import gymnasium; gymnasium.make('sb3_gac:sb3_gac/popgym-AutoencodeEasy-v0')"),
     "envpool": (["envpool"], "import gymnasium; gymnasium.make('sb3_gac:sb3_gac/Go1Getup-v0')"),
     "brax": (["jax", "brax"], "import gymnasium; gymnasium.make('sb3_gac:sb3_gac/brax-Ant-v0')"),

@@ -12,11 +12,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_gac.algorithms import ALGORITHMS, import_path
+from sb3_gac.base.loading import class_of_model
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.entries import encode
 from sb3_gac.math.distributions import TanhGaussian
@@ -86,12 +85,9 @@ def load_frozen_policy(
 
 
 def _loaded(path: Path, device: th.device, name: str) -> BaseAlgorithm:
-    data, _, _ = load_from_zip_file(path, device=device, load_data=True)
-    saved = data or {}
-    paths = [known for known in ALGORITHMS.values() if known.endswith(f":{saved.get('algorithm')}")]
     try:
-        kind = import_path(saved.get("algorithm_path") or paths[0])
-    except (IndexError, ValueError):
+        kind = class_of_model(path, device)
+    except ValueError:
         raise ValueError(
             f"{name}={str(path)!r} is no model of a class that can be imported: pass the loaded model itself."
         ) from None

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_gac.envs.actions import FlattenMultiDiscrete
 from sb3_gac.envs.camera import CameraImage, NoRenderingError
+from sb3_gac.envs.disturbances import DroppedFrames, SensorDelay
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.subprocesses import take_along
@@ -62,6 +63,7 @@ __all__ = [
     "BatchStep",
     "BatchVecEnv",
     "CameraImage",
+    "DroppedFrames",
     "EnvPoolVecEnv",
     "FlattenMultiDiscrete",
     "GroupsVecEnv",
@@ -69,6 +71,7 @@ __all__ = [
     "JaxVecEnv",
     "NoRenderingError",
     "PreviousAction",
+    "SensorDelay",
     "SensorNoise",
     "SplitDictObservation",
     "SplitObservation",

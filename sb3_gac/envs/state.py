@@ -41,6 +41,8 @@ CHANGING: dict[str, tuple[str, ...]] = {
     "sb3_gac.envs.wrappers.SensorNoise": ("_generator", "_drawn", "_n_used"),
     "sb3_gac.envs.wrappers.History": ("_values", "_actions"),
     "sb3_gac.envs.wrappers.PreviousAction": (),
+    "sb3_gac.envs.disturbances.SensorDelay": ("_values",),
+    "sb3_gac.envs.disturbances.DroppedFrames": ("_generator", "_shown"),
     "sb3_gac.envs.camera.CameraImage": (),
     "sb3_gac.envs.goals.AppendDesiredGoal": (),
     "sb3_gac.envs.suites.humanoid_bench.WithSensors": (),

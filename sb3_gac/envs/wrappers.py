@@ -173,7 +173,7 @@ class SensorNoise(EntryWrapper):
         super().__init__(env, key)
         self.noise_std = check_noise_std(noise_std, self._entry, key)
         self._set_entry_space(noisy_box(self._entry, self.noise_std))
-        self._stream = [NOISE_STREAM] * (1 + _count_wrappers(env, SensorNoise))  # apart from noise further in
+        self._stream = [NOISE_STREAM] * (1 + count_wrappers(env, SensorNoise))  # apart from noise further in
         self._generator = np.random.default_rng()
         self._drawn = np.empty((0, *self._entry.shape), dtype=self._entry.dtype)
         self._n_used = 0
@@ -289,7 +289,12 @@ class PreviousAction(EntryWrapper):
         return np.concatenate([value, added], dtype=self._entry.dtype)
 
 
-def _count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
+def count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
+    """
+    :param env: wrapped
+    :param kind: class of a wrapper
+    :return: how many of its layers are of that class
+    """
     count = 0
     while isinstance(env, gym.Wrapper):
         count += isinstance(env, kind)

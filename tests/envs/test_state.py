@@ -27,6 +27,7 @@ def _pendulum():
 MAKERS = {task: lambda task=task: gym.make(f"sb3_gac/{task}-v5", noise_std=0.1) for task in TASKS} | {
     "history": _cheetah_with_history,
     "pendulum": _pendulum,
+    "late and lost": lambda: gym.make("sb3_gac/Hopper-v5", noise_std=0.1, history=3, delay=2, drop=0.4),
     "touching hand": lambda: gym.make("sb3_gac/HandManipulateBlockRotateZTouch-v1", noise_std=0.1),
     "arm with goals": lambda: gym.make("sb3_gac/FetchPush-v4", goal_entries=True),
     "arm with a history": lambda: gym.make("sb3_gac/FetchReach-v4", noise_std=0.1, history=3),

@@ -12,7 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from sb3_gac.envs import FlattenMultiDiscrete, History, SensorNoise, SplitDictObservation, SplitObservation
+from sb3_gac.envs import (
+    DroppedFrames,
+    FlattenMultiDiscrete,
+    History,
+    SensorDelay,
+    SensorNoise,
+    SplitDictObservation,
+    SplitObservation,
+)
 
 
 def _box(*shape, dtype=np.float32):
@@ -103,6 +111,13 @@ CHAINS = {
     "split, noise, history": (FLAT, lambda env: History(SensorNoise(_split(env), 0.1), 3, actions=True)),
     "split, history, noise": (FLAT, lambda env: SensorNoise(History(_split(env), 3, actions=True), 0.1)),
     "history, history": (PAIR, lambda env: History(History(env, 2, actions=True), 2)),
+    "delay": (PAIR, lambda env: SensorDelay(env, 2)),
+    "delay of images": (IMAGE, lambda env: SensorDelay(env, 1)),
+    "drops": (PAIR, lambda env: DroppedFrames(env, 0.5)),
+    "noise, delay, drops, history": (
+        PAIR,
+        lambda env: History(DroppedFrames(SensorDelay(SensorNoise(env, 0.1), 2), 0.5), 3, actions=True),
+    ),
     "noise, noise": (PAIR, lambda env: SensorNoise(SensorNoise(env, 0.1), 0.1, key="privileged")),
 }
 chains = pytest.mark.parametrize(("space", "wrap"), CHAINS.values(), ids=CHAINS.keys())

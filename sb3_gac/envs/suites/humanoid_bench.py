@@ -161,7 +161,13 @@ class WithSensors(gym.ObservationWrapper):
 
 
 def make_humanoid_bench(
-    task: str, noise_std: float = 0.0, privileged: str = "hidden", history: int = 1, **kwargs: Any
+    task: str,
+    noise_std: float = 0.0,
+    privileged: str = "hidden",
+    history: int = 1,
+    delay: int = 0,
+    drop: float = 0.0,
+    **kwargs: Any,
 ) -> gym.Env:
     """
     Build a task without its time limit, which ``gymnasium.make("sb3_gac/<task>-v0")`` adds.
@@ -170,8 +176,10 @@ def make_humanoid_bench(
     :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units
     :param privileged: "hidden" for what ``partial`` lacks; "state" for that and all that ``partial`` shows, without its noise
     :param history: observations that ``partial`` holds, the newest last, followed by the actions between them
+    :param delay: steps by which ``partial`` is late
+    :param drop: probability that an observation of ``partial`` is lost, and the last one shown again
     :param kwargs: of ``humanoid_bench.env.HumanoidEnv``
-    :raises ValueError: if an argument is unknown, ``noise_std`` negative, or ``history`` not positive
+    :raises ValueError: naming the argument that is wrong
     :raises ImportError: if HumanoidBench is not installed, saying how to
     """
     if task not in TASKS:
@@ -183,9 +191,8 @@ def make_humanoid_bench(
     robot, _, name = task.partition("-")
     env = WithSensors(SeededTask(robot, name, **kwargs))
     seen, hidden = env.groups
-    return noisy_with_history(
-        SplitDictObservation(env, [seen], [hidden] if privileged == "hidden" else [seen, hidden]), noise_std, history
-    )
+    split = SplitDictObservation(env, [seen], [hidden] if privileged == "hidden" else [seen, hidden])
+    return noisy_with_history(split, noise_std, history, delay, drop)
 
 
 def _import_bench(environment: str) -> Any:

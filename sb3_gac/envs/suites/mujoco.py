@@ -50,7 +50,15 @@ TASKS: dict[str, TaskLayout] = {
 }
 
 
-def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", history: int = 1, **kwargs: Any) -> gym.Env:
+def make_mujoco(
+    task: str,
+    noise_std: float = 0.1,
+    privileged: str = "state",
+    history: int = 1,
+    delay: int = 0,
+    drop: float = 0.0,
+    **kwargs: Any,
+) -> gym.Env:
     """
     Build a task without its time limit, which ``gymnasium.make("sb3_gac/<task>-v5")`` adds.
 
@@ -58,8 +66,10 @@ def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", hi
     :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
     :param history: noisy observations that ``partial`` holds, the newest last, followed by the actions between them
+    :param delay: steps by which ``partial`` is late
+    :param drop: probability that an observation of ``partial`` is lost, and the last one shown again
     :param kwargs: of the gymnasium environment, but for those that change its observation
-    :raises ValueError: if the task or ``privileged`` is unknown, ``noise_std`` negative, or ``kwargs`` change the layout
+    :raises ValueError: if the task is unknown, another argument is wrong, or ``kwargs`` change the layout
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
@@ -67,7 +77,7 @@ def make_mujoco(task: str, noise_std: float = 0.1, privileged: str = "state", hi
     if misplacing:
         raise ValueError(f"{misplacing} would change the observation, of which the split is made by position.")
     with _without_deprecation():
-        return make_task(TASKS[task], noise_std, privileged, history, **kwargs)
+        return make_task(TASKS[task], noise_std, privileged, history, delay, drop, **kwargs)
 
 
 @contextmanager

@@ -9,7 +9,14 @@ from sb3_gac.envs.suites.layout import TaskLayout, make_task
 LAYOUT = TaskLayout("Pendulum-v1", partial=(0, 1), velocity=(2,))
 
 
-def make_pendulum(noise_std: float = 0.0, privileged: str = "state", history: int = 1, **kwargs: Any) -> gym.Env:
+def make_pendulum(
+    noise_std: float = 0.0,
+    privileged: str = "state",
+    history: int = 1,
+    delay: int = 0,
+    drop: float = 0.0,
+    **kwargs: Any,
+) -> gym.Env:
     """
     Build the task without its time limit, which ``gymnasium.make("sb3_gac/Pendulum-v1")`` adds.
 
@@ -18,10 +25,12 @@ def make_pendulum(noise_std: float = 0.0, privileged: str = "state", history: in
     :param noise_std: standard deviation of the noise on ``partial``; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for the angular velocity alone
     :param history: observations that ``partial`` holds, the newest last, followed by the actions between them
+    :param delay: steps by which ``partial`` is late
+    :param drop: probability that an observation of ``partial`` is lost, and the last one shown again
     :param kwargs: of the gymnasium environment
-    :raises ValueError: if ``privileged`` is unknown, or ``noise_std`` negative
+    :raises ValueError: naming the argument that is wrong
     """
-    return make_task(LAYOUT, noise_std, privileged, history, **kwargs)
+    return make_task(LAYOUT, noise_std, privileged, history, delay, drop, **kwargs)
 
 
 #: Id -> how gymnasium makes it, with its time limit of 200 steps

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 
 from sb3_gac.envs.camera import CameraImage, no_rendering
+from sb3_gac.envs.disturbances import delayed_and_dropped
 from sb3_gac.envs.suites.mujoco import make_mujoco
 from sb3_gac.envs.wrappers import History
 
@@ -24,6 +25,8 @@ def make_pixels(
     camera: str = "track",
     privileged: str = "state",
     noise_std: float = 0.0,
+    delay: int = 0,
+    drop: float = 0.0,
     **kwargs: Any,
 ) -> gym.Env:
     """
@@ -35,8 +38,10 @@ def make_pixels(
     :param camera: its name in the model
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
     :param noise_std: 0: grey levels have no use for it
+    :param delay: steps by which frames are late
+    :param drop: probability that a frame is lost, and the last one shown again
     :param kwargs: of the gymnasium environment, but for those that change its observation
-    :raises ValueError: if an argument is none of these, or ``noise_std`` is not 0
+    :raises ValueError: if an argument is none of these, or ``noise_std`` is not 0, or ``delay`` or ``drop`` wrong
     :raises NoRenderingError: at the first reset, if there is no OpenGL to draw with
     """
     if task not in TASKS:
@@ -51,7 +56,7 @@ def make_pixels(
     except Exception as error:
         raise no_rendering(error) from error
     env = make_mujoco(task, noise_std=0.0, privileged=privileged, **kwargs)
-    return History(CameraImage(env, size, camera), length=frames)
+    return History(delayed_and_dropped(CameraImage(env, size, camera), delay, drop), length=frames)
 
 
 #: Id -> how gymnasium makes it, with its time limit of 1,000 steps

@@ -224,6 +224,8 @@ def make_robotics(
     privileged: str = "hidden",
     history: int = 1,
     goal_entries: bool = False,
+    delay: int = 0,
+    drop: float = 0.0,
     **kwargs: Any,
 ) -> gym.Env:
     """
@@ -236,6 +238,8 @@ def make_robotics(
     :param history: measurements that ``partial`` holds, the newest last, with the actions between them
     :param goal_entries: whether goals stay entries of their own, ``achieved_goal`` and ``desired_goal``, for
         ``HerReplayBuffer``; then ``role_keys`` gives the deployed policy ``["partial", "desired_goal"]``
+    :param delay: steps by which what ``partial`` measures is late; the desired goal never is
+    :param drop: probability that a measurement is lost, and the last one shown again
     :param kwargs: of the gymnasium-robotics environment, such as ``reward_type``, but for those that change its observation
     :raises ValueError: if an argument is unknown, or is for another kind of task
     """
@@ -253,7 +257,7 @@ def make_robotics(
         env = WithSimulatorState(env)
     visible = found.hidden if privileged == "hidden" else _both(found.partial, found.hidden)
     env = SplitDictObservation(env, found.partial, visible, keep=GOALS if found.has_goals else ())
-    env = noisy_with_history(env, noise_std, history)
+    env = noisy_with_history(env, noise_std, history, delay, drop)
     if found.has_goals and not goal_entries:
         env = AppendDesiredGoal(env, (PARTIAL, PRIVILEGED) if privileged == "state" else (PARTIAL,))
     return env

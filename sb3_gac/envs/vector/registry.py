@@ -16,9 +16,12 @@ def make_vec(env_id: str, n_envs: int = 1, seed: int | None = None, **kwargs: An
     :param kwargs: of the environment
     :return: environments whose infos have returns and lengths of episodes
     :raises ImportError: if the simulator is not installed, saying how to
+    :raises ValueError: if ``delay`` or ``drop`` is asked of a simulator that steps a batch
     """
     if not is_batched(env_id):
         return make_vec_env(env_id, n_envs, seed=seed, env_kwargs=kwargs)
+    for name in sorted({"delay", "drop"} & set(kwargs)):
+        raise ValueError(f"{name} is for environments that are stepped one at a time, and {env_id} is one simulator of many.")
     factory, of_task = batch_factory(env_id)
     env: VecEnv = factory(n_envs=n_envs, **of_task | kwargs)
     env.action_space.seed(seed)

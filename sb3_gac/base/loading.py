@@ -1,0 +1,52 @@
+"""Models from files that say whose they are."""
+
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from sb3_gac.algorithms import ALGORITHMS, import_path
+
+MODEL = "model.zip"
+
+
+def model_file(path: Path) -> Path:
+    """
+    :param path: of a model's file, with or without its suffix ``.zip``, or of a run's directory that has one
+    :return: the file
+    :raises FileNotFoundError: if there is none
+    """
+    if path.is_dir():
+        if not (path / MODEL).exists():
+            raise FileNotFoundError(f"{path} has no {MODEL}: the run has not finished, or this is another directory.")
+        return path / MODEL
+    for file in (path, path.with_name(f"{path.name}.zip")):
+        if file.is_file():
+            return file
+    raise FileNotFoundError(f"There is no file or directory {path}.")
+
+
+def class_of_model(path: Path, device: th.device | str = "cpu") -> Any:
+    """
+    :param path: of a file that the ``save`` of one of this package's algorithms, or of a subclass, wrote
+    :param device: where its tensors are put while it is read
+    :return: the class of the model in it
+    :raises ValueError: if it is another file, or its class can't be imported
+    """
+    data, _, _ = load_from_zip_file(path, device=device, load_data=True)
+    saved = data or {}
+    paths = [known for known in ALGORITHMS.values() if known.endswith(f":{saved.get('algorithm')}")]
+    if "algorithm_path" not in saved and not paths:
+        raise ValueError(f"{path} does not say which algorithm of sb3_gac its model is of.")
+    return import_path(saved.get("algorithm_path") or paths[0])
+
+
+def load_model(path: Path, device: th.device | str = "auto") -> Any:
+    """
+    :param path: of a file that an algorithm's ``save`` wrote
+    :param device: to act on
+    :return: the model, of whichever algorithm
+    :raises ValueError: if it is another file, or its class can't be imported
+    """
+    return class_of_model(path).load(path, device=device)

@@ -1,0 +1,57 @@
+"""
+Write the deployed policy of a trained model to a file for the robot, ONNX or TorchScript by the file's suffix::
+
+    python -m sb3_gac.deploy runs/HalfCheetah-... cheetah.onnx --unit partial="rad, rad/s" --unit action="N m"
+
+The file's actions are compared with those of the model before it is written.  docs/deployment.md says how to use it.
+"""
+
+import argparse
+import pickle
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_gac.base.loading import load_model, model_file
+from sb3_gac.deploy.export import WRITERS, export_learner
+from sb3_gac.deploy.normalization import DeploymentNormalizer
+from sb3_gac.deploy.verification import ExportError
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    Command line.
+
+    :param arguments: by default the process's
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path, help="a run's directory, or a model's zip")
+    parser.add_argument("out", type=Path, help=f"the file to write, with the suffix {' or '.join(WRITERS)}")
+    parser.add_argument("--vec-normalize", type=Path, metavar="FILE", help="statistics of VecNormalize, as it saved them")
+    parser.add_argument(
+        "--unit", action="append", default=[], metavar="ENTRY=UNIT", help="of an entry, or of the action; may be repeated"
+    )
+    options = parser.parse_args(arguments)
+    malformed = [text for text in options.unit if "=" not in text]
+    if malformed:
+        parser.error(f"--unit: must be ENTRY=UNIT, such as action=Nm, got {malformed[0]!r}.")
+    units = dict(text.split("=", 1) for text in options.unit)
+    try:
+        model = load_model(model_file(options.model), device="cpu")
+        normalizer = None if options.vec_normalize is None else _normalizer(options.vec_normalize)
+        path = export_learner(model, options.out, normalizer, units)
+    except (ValueError, FileNotFoundError, ImportError, ExportError) as error:
+        sys.exit(str(error))
+    reads = " and ".join(model.policy.role_keys[model.policy.roles.deployed])
+    print(f"Wrote {path}: the deployed policy of {type(model).__name__}, which reads {reads}; its actions were compared.")
+
+
+def _normalizer(path: Path) -> DeploymentNormalizer:
+    if not path.is_file():
+        raise FileNotFoundError(f"--vec-normalize: there is no file {path}.")
+    with path.open("rb") as file:
+        return DeploymentNormalizer.from_vec_normalize(pickle.load(file))
+
+
+if __name__ == "__main__":
+    main()

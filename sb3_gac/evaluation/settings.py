@@ -1,0 +1,195 @@
+"""What the sensor does in an evaluation, and the environment in which it does so."""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import yaml
+
+from sb3_gac.algorithms import import_path
+from sb3_gac.envs.disturbances import disturb
+from sb3_gac.envs.spaces import PARTIAL
+from sb3_gac.envs.suites import SUITES, batch_factory, env_id_of, is_batched, suite_of
+
+CONFIGURATION = "config.yaml"
+#: What is evaluated if nothing else is asked for
+DEFAULTS: dict[str, list[Any]] = {"noise": [0.0, 0.1, 0.2, 0.3], "delay": [0, 1, 2], "drop": [0.0, 0.1, 0.3]}
+#: Of a setting -> what environments of this package call it
+ARGUMENTS = {"noise": "noise_std", "delay": "delay", "drop": "drop"}
+
+
+class Setting(NamedTuple):
+    """
+    What the sensor does.
+
+    :param noise: standard deviation of the noise on ``partial``, in its own units
+    :param delay: steps by which ``partial`` is late
+    :param drop: probability that an observation is lost, and the last one shown again
+    """
+
+    noise: float = 0.0
+    delay: int = 0
+    drop: float = 0.0
+
+    def __str__(self) -> str:
+        return f"noise {self.noise:g}, delay {self.delay}, drop {self.drop:g}"
+
+
+UNDISTURBED = Setting()
+
+
+def plan(asked: Mapping[str, Sequence[Any]], trained: Setting) -> tuple[list[Setting], dict[str, list[Setting]]]:
+    """
+    One thing is varied at a time. A single value holds for all settings; of several, each makes a setting, and so does that of
+    training; in these, all else is as in training, or what a single value says.
+
+    :param asked: name of a part of the setting -> its values
+    :param trained: the setting of training
+    :return: all settings, the undisturbed one first; and name -> those in which it varies, in ascending order
+    """
+    base = trained._replace(**{name: values[0] for name, values in asked.items() if len(set(values)) == 1})
+    curves = {
+        name: [base._replace(**{name: value}) for value in sorted({*values, getattr(trained, name)})]
+        for name, values in asked.items()
+        if len(set(values)) > 1
+    }
+    settings = [UNDISTURBED, *(setting for settings in curves.values() for setting in settings)]
+    return list(dict.fromkeys(settings if curves else [UNDISTURBED, base])), curves
+
+
+@dataclass(frozen=True)
+class Environment:
+    """
+    Where a policy is evaluated.
+
+    :param env_id: of gymnasium, ``module:id`` of one that a module registers, or ``module:name`` of a class or function
+    :param kwargs: keyword arguments of it
+    :param wrappers: around it, from the inside to the outside, each ``module:Class`` and its keyword arguments
+    """
+
+    env_id: str
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    wrappers: Sequence[Mapping[str, Mapping[str, Any]]] = ()
+
+    def make(self, setting: Setting, render_mode: str | None = None) -> gym.Env:
+        """
+        :param setting: that the environment's own arguments bring about where it has them, and wrappers where it has not
+        :param render_mode: of gymnasium
+        :raises ValueError: if there is no such environment, or its observations have no ``partial``
+        """
+        values = {ARGUMENTS[name]: value for name, value in setting._asdict().items()}
+        own = {name: value for name, value in values.items() if name in self._parameters}
+        rendering = {} if render_mode is None else {"render_mode": render_mode}
+        env = self._creator(**{**self.kwargs, **own, **rendering})
+        for path, arguments in (item for wrapper in self.wrappers for item in wrapper.items()):
+            env = import_path(path)(env, **arguments)
+        entries = getattr(env.observation_space, "spaces", {})
+        if PARTIAL not in entries:
+            raise ValueError(f'{self.env_id} has no entry "{PARTIAL}" in its observations: {env.observation_space}.')
+        return disturb(env, **{name: value for name, value in values.items() if name not in own})
+
+    @property
+    def trained(self) -> Setting:
+        """What the sensor does if nobody says otherwise: the environment's arguments, or their defaults."""
+        known: dict[str, Any] = {}
+        for name, argument in ARGUMENTS.items():
+            default = self._parameters[argument].default if argument in self._parameters else inspect.Parameter.empty
+            value = self.kwargs.get(argument, default)
+            if value is inspect.Parameter.empty:
+                continue
+            if not isinstance(value, (int, float)):
+                raise ValueError(f"{argument} of {self.env_id} must be a number here, for all of partial, got {value!r}.")
+            known[name] = value
+        return Setting(**known)
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether sensor noise is its own argument; if not, noise comes on top of what it has."""
+        return ARGUMENTS["noise"] in self._parameters
+
+    @property
+    def _creator(self) -> Callable[..., gym.Env]:
+        module, colon, name = self.env_id.partition(":")
+        if colon:
+            try:
+                import_module(module)
+            except ModuleNotFoundError as error:
+                raise ValueError(f"--env {self.env_id}: there is no module {error.name!r} on Python's path.") from None
+        if colon and name not in gym.registry:
+            creator: Callable[..., gym.Env] = import_path(self.env_id)
+            return creator
+        return lambda **kwargs: gym.make(name if colon else self.env_id, **kwargs)
+
+    @property
+    def _parameters(self) -> Mapping[str, inspect.Parameter]:
+        """Those of what makes it."""
+        creator = self._creator  # which imports its module
+        name = self.env_id.rpartition(":")[2]
+        if name not in gym.registry:
+            if ":" not in self.env_id:
+                gym.spec(self.env_id)  # raises, and says what may be meant
+            return inspect.signature(creator).parameters
+        if is_batched(name):
+            return _of_batch(name)
+        entry_point = gym.registry[name].entry_point
+        made_by = import_path(entry_point) if isinstance(entry_point, str) else entry_point
+        assert made_by is not None
+        return inspect.signature(made_by).parameters
+
+
+def _of_batch(env_id: str) -> Mapping[str, inspect.Parameter]:
+    """Simulators of many take noise, some of them under ``**kwargs``."""
+    parameters = dict(inspect.signature(batch_factory(env_id)[0]).parameters)
+    if SUITES[suite_of(env_id) or ""].sensor_noise:
+        name = ARGUMENTS["noise"]
+        parameters.setdefault(name, inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=0.0))
+    return parameters
+
+
+def environment_of_run(directory: Path) -> Environment:
+    """
+    :param directory: of a run of ``sb3_gac.train``, or of the benchmarks
+    :return: the environment that it was trained in
+    """
+    configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
+    run = configuration.get("run", configuration)
+    made = run.get("environment")
+    if made is not None:
+        return Environment(made["id"], made["kwargs"], made.get("wrappers", ()))
+    given = {"noise_std": run["noise"], "history": run.get("history"), "privileged": run.get("privileged")}
+    usual = {"history": 1, "privileged": "state"}  # which not every environment has as an argument
+    kwargs = {name: value for name, value in given.items() if value not in (None, usual.get(name))}
+    return Environment(env_id_of(run["task"]), kwargs)
+
+
+def check_fits(entries: Mapping[str, tuple[int, ...]], env: gym.Env, name: str) -> None:
+    """
+    :param entries: that a policy reads, with their shapes
+    :param env: whose observations it is to get
+    :param name: of the environment, for the message
+    :raises ValueError: naming the entry that is missing or of another shape
+    """
+    shown = env.observation_space.spaces  # type: ignore[attr-defined]
+    for key, shape in entries.items():
+        if key not in shown:
+            raise ValueError(
+                f'The policy reads an entry "{key}", and {name} has {list(shown)}: evaluate it where it was trained.'
+            )
+        if sorted(shown[key].shape) != sorted(shape):  # images may have their channels first or last
+            raise ValueError(
+                f'The policy reads "{key}" of the shape {shape}, and {name} shows {tuple(shown[key].shape)}: make the '
+                'environment as in training, such as by --env-kwargs "{history: 4}".'
+            )
+
+
+def is_real_valued(env: gym.Env) -> bool:
+    """
+    :param env: with ``partial``
+    :return: whether noise can be added to it
+    """
+    return bool(np.issubdtype(env.observation_space[PARTIAL].dtype, np.floating))  # type: ignore[index]

@@ -1,0 +1,161 @@
+"""A film of an episode: the simulator, and under it what the sensor measured beside what the policy got of it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import matplotlib
+import numpy as np
+
+from sb3_gac.envs.camera import no_rendering
+from sb3_gac.envs.disturbances import DroppedFrames, SensorDelay, insert_above, sensor_layer
+from sb3_gac.envs.spaces import PARTIAL
+from sb3_gac.envs.state import layers
+from sb3_gac.envs.suites.extras import import_extra
+from sb3_gac.envs.wrappers import SensorNoise
+from sb3_gac.evaluation.policies import EvaluatedPolicy
+
+EXTRA, PROGRAM = "video", "sb3-gac evaluate --video"
+STRIP, MARGIN, WINDOW = 140, 12, 100  # pixels, pixels, steps
+MEASURED, GOT, PAPER, INK = (120, 120, 120), (230, 100, 0), (255, 255, 255), (30, 30, 30)
+Series = list[np.ndarray]
+
+
+class Tap(gym.ObservationWrapper):
+    """
+    Remembers an entry as it was last.
+
+    :param env: whose observation stays as it is
+    """
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.latest = np.empty(0)
+
+    def observation(self, observation: Any) -> Any:
+        """See gymnasium's ``ObservationWrapper``."""
+        self.latest = np.array(observation[PARTIAL])
+        return observation
+
+
+def tapped(env: gym.Env) -> tuple[gym.Env, Tap, Tap]:
+    """
+    :param env: wrapped, changed in place
+    :return: the environment, and two taps of it: of what the sensor measures, without noise, and of what arrives
+    """
+    arriving = sensor_layer(env)
+    disturbing = [layer for layer in layers(arriving) if isinstance(layer, (SensorNoise, SensorDelay, DroppedFrames))]
+    measured = disturbing[-1].env if disturbing else arriving
+    taps: list[Tap] = []
+
+    def tap(layer: gym.Env) -> gym.Env:
+        taps.append(Tap(layer))
+        return taps[-1]
+
+    env = insert_above(env, measured, tap)
+    outermost = taps[0] if arriving is measured else arriving
+    return insert_above(env, outermost, tap), taps[0], taps[1]
+
+
+def check_can_film(env: gym.Env, name: str) -> None:
+    """
+    :param env: made with ``render_mode="rgb_array"``
+    :param name: of the environment, for the message
+    :raises ImportError: if what writes videos is not installed, saying how to
+    :raises RuntimeError: if the environment can't be drawn, saying why
+    """
+    for module in ("moviepy", "PIL"):
+        import_extra(module, EXTRA, PROGRAM)
+    env.reset(seed=0)
+    try:
+        frame = env.render()
+    except Exception as error:
+        if "mujoco" in f"{type(env.unwrapped).__module__} {error}".lower() or "gl" in str(error).lower():
+            raise no_rendering(error) from error
+        raise RuntimeError(f"--video: {name} can't be drawn here ({type(error).__name__}: {error}).") from error
+    if not isinstance(frame, np.ndarray):
+        raise RuntimeError(f'--video: {name} has no render_mode "rgb_array": leave --video out.')
+
+
+def film(policy: EvaluatedPolicy, env: gym.Env, seed: int, title: str, path: Path) -> float:
+    """
+    :param policy: to act, deterministically
+    :param env: made with ``render_mode="rgb_array"``, not yet reset
+    :param seed: of the episode
+    :param title: of the setting
+    :param path: of the video
+    :return: the episode's return
+    """
+    from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
+
+    env, measured, got = tapped(env)
+    steps = list(_played(policy, env, seed, measured, got))
+    series = [np.stack([step[of] for step in steps]) for of in (0, 1)]
+    writer, total = None, 0.0
+    for step, (_, _, total) in enumerate(_played(policy, env, seed, measured, got)):
+        frame = _composed(np.asarray(env.render()), series, step, f"{title}    step {step}    return {total:.1f}")
+        if writer is None:
+            fps = env.unwrapped.metadata.get("render_fps", 30)
+            writer = FFMPEG_VideoWriter(str(path), frame.shape[1::-1], fps)
+        writer.write_frame(frame)
+    assert writer is not None
+    for _ in range(fps):  # a second to look at the end
+        writer.write_frame(frame)
+    writer.close()
+    return total
+
+
+def _played(
+    policy: EvaluatedPolicy, env: gym.Env, seed: int, measured: Tap, got: Tap
+) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+    """Of each step, from the reset on: what was measured, what arrived, and the return so far. It is the same every time."""
+    observation, _ = env.reset(seed=seed)
+    policy.start(1)
+    starts, total, is_over = np.ones(1, dtype=bool), 0.0, False
+    yield measured.latest, got.latest, total
+    while not is_over:
+        (action,) = policy.act({key: np.asarray(value)[None] for key, value in observation.items()}, starts)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        starts, total, is_over = np.zeros(1, dtype=bool), total + float(reward), terminated or truncated
+        yield measured.latest, got.latest, total
+
+
+def _composed(picture: np.ndarray, series: Series, step: int, caption: str) -> np.ndarray:
+    """
+    :param picture: of the simulator, shape (H, W, 3)
+    :param series: what was measured and what arrived in all steps, shapes (T, ...)
+    :param step: to show
+    :param caption: above
+    :return: picture between caption and strip, with even sides, as video codecs have them
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), 13)
+    height, width = picture.shape[:2]
+    top, is_vector = 2 * MARGIN + 4, series[0].ndim == 2
+    size = (width + width % 2, top + height + is_vector * STRIP)
+    canvas = Image.new("RGB", (size[0], size[1] + size[1] % 2), PAPER)
+    canvas.paste(Image.fromarray(picture[..., :3]), (0, top))
+    draw = ImageDraw.Draw(canvas)
+    draw.text((MARGIN, MARGIN // 2), caption, INK, font)
+    if is_vector:
+        _draw_strip(draw, font, series, step, (MARGIN, top + height + 26, width - MARGIN, top + height + STRIP - MARGIN))
+    return np.asarray(canvas)
+
+
+def _draw_strip(draw: Any, font: Any, series: Series, step: int, box: tuple[int, int, int, int]) -> None:
+    """The last steps of the component that moves most, as it was measured and as it arrived."""
+    left, top, right, bottom = box
+    component = int(np.argmax(series[0].std(axis=0)))
+    measured, got = (values[:, component] for values in series)
+    low, high = min(measured.min(), got.min()), max(measured.max(), got.max())
+    steps = np.arange(max(step - WINDOW, 0), step + 1)
+    x = left + (steps - steps[0]) / min(WINDOW, len(measured) - 1) * (right - left)
+    for values, colour in ((got, GOT), (measured, MEASURED)):
+        y = bottom - (values[steps] - low) / max(high - low, 1e-9) * (bottom - top)
+        if len(steps) > 1:
+            draw.line(list(zip(x.tolist(), y.tolist(), strict=True)), colour, 2)
+    draw.text((left, top - 20), f"partial[{component}]:", INK, font)
+    draw.text((left + 90, top - 20), "as it is", MEASURED, font)
+    draw.text((left + 160, top - 20), "as the policy gets it", GOT, font)

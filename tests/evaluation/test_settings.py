@@ -1,0 +1,108 @@
+"""Which settings are evaluated, and how each comes about in an environment."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import yaml
+
+from sb3_gac.envs import DroppedFrames, History, SensorDelay, SensorNoise
+from sb3_gac.envs.state import layers
+from sb3_gac.evaluation.settings import UNDISTURBED, Environment, Setting, check_fits, environment_of_run, plan
+from tests.evaluation.helpers import ENV
+
+NOISY = "tests.evaluation.helpers:noisy_walk"
+
+
+def _disturbances(env):
+    kinds = (SensorNoise, SensorDelay, DroppedFrames, History)
+    return [layer for layer in layers(env) if isinstance(layer, kinds)]
+
+
+def test_one_thing_is_varied_at_a_time():
+    settings, curves = plan({"noise": [0.3, 0.0], "delay": [0, 2]}, Setting(noise=0.1))
+    assert curves == {
+        "noise": [Setting(0.0), Setting(0.1), Setting(0.3)],
+        "delay": [Setting(0.1, 0), Setting(0.1, 2)],
+    }
+    assert settings == [UNDISTURBED, Setting(0.1), Setting(0.3), Setting(0.1, 2)], "each once, the undisturbed one first"
+
+
+def test_a_single_value_holds_for_all_settings():
+    settings, curves = plan({"noise": [0.2], "drop": [0.1, 0.5]}, Setting(noise=0.1, delay=1))
+    assert curves == {"drop": [Setting(0.2, 1, 0.0), Setting(0.2, 1, 0.1), Setting(0.2, 1, 0.5)]}
+    assert settings == [UNDISTURBED, *curves["drop"]]
+
+
+def test_single_values_alone_make_one_setting_beside_the_undisturbed_one():
+    assert plan({"noise": [0.2], "delay": [3]}, Setting()) == ([UNDISTURBED, Setting(0.2, 3)], {})
+    assert plan({"noise": [0.0]}, Setting()) == ([UNDISTURBED], {})
+
+
+def test_registered_tasks_bring_a_setting_about_by_their_own_arguments():
+    environment = Environment("sb3_gac/Pendulum-v1", {"history": 2, "noise_std": 0.3, "delay": 1})
+    assert environment.trained == Setting(0.3, 1, 0.0)
+    found = _disturbances(environment.make(Setting(0.1, 2, 0.5)))
+    assert [type(layer) for layer in found] == [History, DroppedFrames, SensorDelay, SensorNoise]
+    assert (found[1].probability, found[2].steps, found[3].noise_std) == (0.5, 2, np.float32(0.1))
+    assert [type(layer) for layer in _disturbances(environment.make(UNDISTURBED))] == [History, SensorNoise]
+
+
+def test_what_is_trained_by_default_is_the_environments_default():
+    assert Environment("sb3_gac/HalfCheetah-v5").trained == Setting(0.1)
+    assert Environment("sb3_gac/Pendulum-v1").trained == UNDISTURBED
+    assert Environment("sb3_gac/TigerDoor-v0").trained == UNDISTURBED
+    assert Environment("sb3_gac/brax-Ant-v0").trained == Setting(0.1), "known without the simulator"
+    assert Environment("sb3_gac/Go1Getup-v0", {"noise_std": 0.2}).trained == Setting(0.2)
+    assert Environment("sb3_gac/Go1Getup-v0").has_noise
+    with pytest.raises(ValueError, match=r"noise_std of .* must be a number here.*\[0.1, 0.2\]"):
+        _ = Environment("sb3_gac/Pendulum-v1", {"noise_std": [0.1, 0.2]}).trained
+
+
+def test_an_environment_of_ones_own_gets_wrappers_beneath_its_memory():
+    environment = Environment(NOISY, {"history": 3})
+    assert environment.trained == Setting(0.2)
+    found = _disturbances(environment.make(Setting(0.5, 2, 0.1)))
+    assert [type(layer) for layer in found] == [History, DroppedFrames, SensorDelay, SensorNoise]
+    assert found[-1].noise_std == np.float32(0.5), "its own argument, not noise on top"
+    plain = Environment(ENV)
+    assert not plain.has_noise
+    assert [type(layer) for layer in _disturbances(plain.make(Setting(0.5, 2)))] == [SensorDelay, SensorNoise]
+
+
+def test_environments_that_are_not_there():
+    with pytest.raises(ValueError, match="--env no_such_module:Env: there is no module 'no_such_module'"):
+        _ = Environment("no_such_module:Env").trained
+    with pytest.raises(ValueError, match="has no 'Nothing'"):
+        Environment("tests.evaluation.helpers:Nothing").make(UNDISTURBED)
+    with pytest.raises(gym.error.Error, match="HalfCheetha"):
+        _ = Environment("sb3_gac/HalfCheetha-v5").trained
+    with pytest.raises(ValueError, match='Pendulum-v1 has no entry "partial"'):
+        Environment("Pendulum-v1").make(UNDISTURBED)
+
+
+def test_a_runs_configuration_says_where_it_was_trained(tmp_path):
+    run = {"task": "Hopper", "noise": 0.2, "history": 3, "privileged": "velocity", "seed": 1}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(run))
+    expected = Environment("sb3_gac/Hopper-v5", {"noise_std": 0.2, "history": 3, "privileged": "velocity"})
+    assert environment_of_run(tmp_path) == expected
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"task": "Hopper", "noise": 0.2}))
+    assert environment_of_run(tmp_path) == Environment("sb3_gac/Hopper-v5", {"noise_std": 0.2})
+    run = {"task": "Hopper", "noise": 0.0, "environment": None}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"run": run, "arguments": {}}))
+    assert environment_of_run(tmp_path) == Environment("sb3_gac/Hopper-v5", {"noise_std": 0.0}), "of a benchmark"
+    wrappers = [{"sb3_gac.envs:History": {"length": 3}}]
+    run = {"task": None, "noise": None, "environment": {"id": ENV, "kwargs": {}, "wrappers": wrappers}}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(run))
+    environment = environment_of_run(tmp_path)
+    assert environment == Environment(ENV, {}, wrappers)
+    kinds = [type(layer) for layer in _disturbances(environment.make(Setting(0.1, 1)))]
+    assert kinds == [History, SensorDelay, SensorNoise]
+
+
+def test_what_the_policy_reads_must_be_shown():
+    env = Environment(ENV).make(UNDISTURBED)
+    check_fits({"partial": (2,)}, env, ENV)
+    with pytest.raises(ValueError, match=r'reads "partial" of the shape \(9,\).*shows \(2,\).*--env-kwargs "\{history: 4\}"'):
+        check_fits({"partial": (9,)}, env, ENV)
+    with pytest.raises(ValueError, match='reads an entry "goal"'):
+        check_fits({"goal": (2,)}, env, ENV)
