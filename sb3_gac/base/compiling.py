@@ -1,4 +1,4 @@
-"""Whether gradient steps are compiled: as the argument ``compile`` says or, if it says "auto", where it is possible and pays."""
+"""Whether gradient steps are compiled: as ``compile`` says or, if it says "auto", where it is possible and pays."""
 
 import warnings
 from abc import abstractmethod
@@ -53,7 +53,7 @@ class Compilation(BaseAlgorithm):
         self._compiles_on_auto, why = self._decide(before)
         self.compile_decision = f'compile="auto": gradient steps are {"" if self.compiles else "not "}compiled, {why}.'
         if self.verbose >= 1:
-            print(self.compile_decision)
+            print(self.compile_decision)  # noqa: T201  # as SB3 does
 
     def _decide(self, before: bool | None) -> tuple[bool, str]:
         """
@@ -75,8 +75,8 @@ class Compilation(BaseAlgorithm):
             return True, "as they were before"
         to_come = self.gradient_steps_in(self._total_timesteps - self.num_timesteps)
         if to_come < PAYS_FROM:
-            return False, f"for {to_come:,} to come are too few to pay for compiling: it takes {PAYS_FROM:,}"
-        return True, f"which takes about half a minute and pays for the {to_come:,} to come"
+            return False, f"for {to_come:,} are to come, and half a minute of compiling pays from {PAYS_FROM:,} on"
+        return True, f"for {to_come:,} are to come, which pays for half a minute of compiling"
 
     def check_can_compile(self) -> None:
         """

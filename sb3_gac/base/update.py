@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
+
 from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
 from sb3_gac.base.compiling import AUTO, Compilation
 from sb3_gac.base.policy import AsymmetricPolicy

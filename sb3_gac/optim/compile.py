@@ -100,25 +100,27 @@ class Program:
             "fallback_random": True,  # the random numbers of the plain function
             "guard_filter_fn": th.compiler.skip_all_guards_unsafe,
         }
-        self._run = th.compile(_with_own_code(function), fullgraph=True, dynamic=False, options=options)
+        with _compiling:  # which it begins to import
+            self._run = th.compile(_with_own_code(function), fullgraph=True, dynamic=False, options=options)
         self._is_ready = False
 
     def __call__(self, *args: Any) -> Any:
         """The function's value, with parameters as they are now."""
         if self._is_ready:
             return self._run(*args)
-        import torch._dynamo.config
-        from torch._dynamo.exc import TorchDynamoException
+        with _compiling:
+            import torch._dynamo.config
+            from torch._dynamo.exc import TorchDynamoException
 
-        try:
-            with _compiling, torch._dynamo.config.patch(trace_autograd_ops=True):
+            try:
+                with torch._dynamo.config.patch(trace_autograd_ops=True):
+                    result = self._run(*args)
+            except TorchDynamoException as error:  # nothing has run yet
+                if self._when_it_fails is None:
+                    raise
+                self._when_it_fails(error)
+                self._run = self._function
                 result = self._run(*args)
-        except TorchDynamoException as error:  # nothing has run yet
-            if self._when_it_fails is None:
-                raise
-            self._when_it_fails(error)
-            self._run = self._function
-            result = self._run(*args)
         self._is_ready = True
         return result
 

@@ -35,11 +35,9 @@ def test_it_is_compiled_where_enough_gradient_steps_are_to_come(steps, compiled,
     model.learn(steps, log_interval=10**6)
     assert model.compiles == compiled == bool(model.programs)
     assert capsys.readouterr().out.count("compile=") == 1
-    assert model.compile_decision == (
-        f'compile="auto": gradient steps are compiled, which takes about half a minute and pays for the {steps - 10} to come.'
-        if compiled
-        else 'compile="auto": gradient steps are not compiled, for 99 to come are too few to pay for compiling: it takes 100.'
-    )
+    decided, why = ("compiled", "which pays for half a minute of compiling") if compiled else ("not compiled", "")
+    why = why or "and half a minute of compiling pays from 100 on"
+    assert model.compile_decision == f'compile="auto": gradient steps are {decided}, for {steps - 10} are to come, {why}.'
 
 
 def test_nothing_is_said_unless_asked_for(capsys):
