@@ -228,7 +228,7 @@ def test_a_run_that_was_stopped_while_it_was_evaluated_is_evaluated(tmp_path, mo
 def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, capsys):
     for content, message in {
         None: "there is no config.yaml in it",
-        "config.yaml": "leave out --steps, --env-kwargs",
+        "config.yaml": "leave out --env-kwargs, --steps",
         "results.json": "this run is finished",
     }.items():
         if content is not None:

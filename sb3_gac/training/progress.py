@@ -91,9 +91,9 @@ class Progress(BaseCallback):
         if kl is not None:
             parts.append(f"KL {kl:.2g}" + ("" if target is None else f"/{target:.2g}"))
         left = self.seconds_left()
-        if left:
+        if left and left >= 0.5:
             parts.append(f"{clock(left)} left")
-        elif left == 0:
+        elif left is not None:
             parts.append(f"{clock(time.monotonic() - self._started)} in all")
         elif self.num_timesteps < getattr(self.model, "learning_starts", 0):
             parts.append("warm-up")
@@ -107,7 +107,7 @@ class Progress(BaseCallback):
             parts.append(f"KL {last['kl']:.2g}" + (f" (target {last['target_kl']:.2g})" if "target_kl" in last else ""))
         width = len(f"{self._total:,}")
         left = self.seconds_left()
-        times = f"{clock(time.monotonic() - self._started)} so far" + (f", {clock(left)} left" if left else "")
+        times = f"{clock(time.monotonic() - self._started)} so far" + (f", {clock(left)} left" if left and left >= 0.5 else "")
         return f"{self.num_timesteps:{width},} of {self._total:,} steps: {', '.join(parts)}; {times}"
 
     def _returns(self) -> dict[str, float]:

@@ -82,22 +82,29 @@ def test_while_results_are_written(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a terminal of its own")
 def test_in_a_terminal(tmp_path):
     """What a person sees: a bar, and after Ctrl-C what is being done and then how to go on, on 80 columns."""
+    import fcntl
     import pty
+    import select
+    import struct
+    import termios
 
     arguments = ["--env", "tests.training.test_options:make_own", "--steps", "100000", "--episodes", "1"]
     child, terminal = pty.fork()
     if child == 0:
         os.chdir(tmp_path)
-        os.environ |= {"PYTHONPATH": str(ROOT), "COLUMNS": "80"}
+        os.environ["PYTHONPATH"] = str(ROOT)
         os.execv(sys.executable, [sys.executable, "-m", "sb3_gac.train", *arguments])
-    shown, pressed, deadline = b"", False, time.time() + 120
-    while time.time() < deadline:
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    shown, pressed, deadline = b"", False, time.time() + 240
+    while select.select([terminal], [], [], max(deadline - time.time(), 0))[0]:
         try:
             shown += os.read(terminal, 4096)
         except OSError:  # it has ended
             break
         if not pressed and b"/100,000" in shown:
             pressed = bool(os.write(terminal, b"\x03"))
+    else:
+        os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     assert os.waitstatus_to_exitcode(status) == 130
     lines = re.split(r"[\r\n]+", shown.decode().strip())
