@@ -4,13 +4,13 @@ import argparse
 import json
 import os
 import shlex
-import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -22,14 +22,13 @@ from benchmarks.finished import read_tidy
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, findings, recommendation, worth
 from benchmarks.suite import NAME, RunSpec, check_is, default_name, read_definitions, read_suite
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
+from sb3_gac.optim.compile import PAYS_FROM, missing_compiler
 from sb3_gac.presets import PRESETS, read_preset
-from sb3_gac.train import UniformActions
+from sb3_gac.training.evaluation import UniformActions
+from sb3_gac.training.options import from_yaml, mapping, positive
 
 ALGORITHMS = (FULL, ASYMMETRIC, GUIDED, PARTIAL)
 EVALUATIONS, RANDOM_EPISODES = 20, 30
-#: From as many steps on a compiled gradient step saves more than the half minute that compiling takes
-COMPILED_FROM = 10_000
-_COMPILERS = ("g++", "clang++", "c++")
 _OF_TASKS = {"noise_std", "history"}
 
 
@@ -45,11 +44,11 @@ def parse_arguments(description: str | None, arguments: Sequence[str] | None = N
     parser.add_argument(
         "--env", required=True, help="an id, my_module:MyEnv-v0, or my_module:make_env, a class or function that makes one"
     )
-    parser.add_argument("--env-kwargs", type=_mapping, default={}, metavar="YAML", help='such as "{noise_std: 0.1}"')
+    parser.add_argument("--env-kwargs", type=mapping, default={}, metavar="YAML", help='such as "{noise_std: 0.1}"')
     parser.add_argument(
         "--wrappers",
         nargs="+",
-        type=_yaml,
+        type=from_yaml,
         default=[],
         metavar="MODULE:CLASS",
         help='around it, from the inside to the outside; with arguments as in "sb3_gac.envs:History: {length: 4}"',
@@ -62,39 +61,17 @@ def parse_arguments(description: str | None, arguments: Sequence[str] | None = N
     parser.add_argument(
         "--algorithms", nargs="+", default=ALGORITHMS, choices=known, metavar="NAME", help=f"of {', '.join(known)}"
     )
-    parser.add_argument("--seeds", type=_positive, default=5, help="runs of each algorithm (default: 5)")
-    parser.add_argument("--steps", type=_positive, default=20_000, help="of each run (default: 20000)")
-    parser.add_argument("--eval-episodes", type=_positive, default=10, help="of each evaluation (default: 10)")
+    parser.add_argument("--seeds", type=positive, default=5, help="runs of each algorithm (default: 5)")
+    parser.add_argument("--steps", type=positive, default=20_000, help="of each run (default: 20000)")
+    parser.add_argument("--eval-episodes", type=positive, default=10, help="of each evaluation (default: 10)")
     parser.add_argument("--preset", choices=sorted(PRESETS), help="arguments of the algorithms (default: small)")
-    parser.add_argument(
-        "--overrides", type=_mapping, default={}, metavar="YAML", help='of the preset, such as "{gamma: 0.95}"'
-    )
-    parser.add_argument("--jobs", type=_positive, help="runs side by side (default: one on each CPU)")
+    parser.add_argument("--overrides", type=mapping, default={}, metavar="YAML", help='of the preset, such as "{gamma: 0.95}"')
+    parser.add_argument("--jobs", type=positive, help="runs side by side (default: one on each CPU)")
     parser.add_argument("--ray", nargs="?", const="auto", metavar="ADDRESS", help="run on a Ray cluster instead")
     parser.add_argument("--out", type=Path, help="directory of everything (default: comparisons/<environment>)")
     options = parser.parse_args(arguments)
     options.out = (options.out or Path("comparisons") / default_name(options.env).replace(":", "-")).resolve()
     return options
-
-
-def _positive(text: str) -> int:
-    if (value := int(text)) < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {text}")
-    return value
-
-
-def _yaml(text: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no YAML: {error}") from None
-
-
-def _mapping(text: str) -> dict[str, Any]:
-    found = _yaml(text)
-    if not isinstance(found, Mapping):
-        raise argparse.ArgumentTypeError(f'must be a mapping, such as "{{key: 0.1}}", got {text!r}')
-    return dict(found)
 
 
 def suite_of_options(options: argparse.Namespace) -> dict[str, Any]:
@@ -108,7 +85,7 @@ def suite_of_options(options: argparse.Namespace) -> dict[str, Any]:
     overrides = dict(options.overrides)
     if "env" in cell and not options.whole_state:
         overrides = {"role_keys": None, **overrides}
-    if "compile" not in overrides and options.steps >= COMPILED_FROM and any(map(shutil.which, _COMPILERS)):
+    if "compile" not in overrides and options.steps >= PAYS_FROM and missing_compiler(th.device("cpu")) is None:
         overrides["compile"] = True
     return {
         "steps": options.steps,

@@ -1,18 +1,15 @@
 """The environment of a run: a registered task with its sensor noise, or any of gymnasium's, with arguments and wrappers."""
 
-from collections.abc import Mapping, Sequence
-from functools import partial
-from importlib import import_module
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.suite import RunSpec
-from sb3_gac.algorithms import import_path
 from sb3_gac.envs import make_vec
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
+from sb3_gac.training.environments import make_envs as make_any_envs
 
 #: Of the environments of every evaluation
 EVAL_SEED = 10_000
@@ -49,8 +46,7 @@ def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:
     env_id, kwargs = environment(spec)
     if spec.environment is None:
         return make_vec(env_id, n_envs, seed, **kwargs)
-    # What counts returns goes around the wrappers: one of them may change rewards, or end episodes
-    return make_vec_env(partial(make_wrapped, env_id, kwargs, spec.environment["wrappers"]), n_envs, seed=seed)
+    return make_any_envs(env_id, kwargs, spec.environment["wrappers"], n_envs, seed)
 
 
 def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = True) -> VecEnv:
@@ -60,26 +56,3 @@ def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = 
     :param training: whether it gathers statistics
     """
     return env if options is None else VecNormalize(env, **{"norm_reward": False, "training": training, **options})
-
-
-def make_wrapped(env_id: str, kwargs: Mapping[str, Any], wrappers: Sequence[Mapping[str, Mapping[str, Any]]]) -> gym.Env:
-    """
-    :param env_id: of gymnasium, after the module that registers it and a colon if need be; or ``module:name`` of a class or
-        function that makes an environment
-    :param kwargs: of the environment
-    :param wrappers: from the inside to the outside, each ``module:Class`` and its keyword arguments
-    :raises ValueError: if a wrapper can't be imported
-    """
-    env = _make(env_id, kwargs)
-    for wrapper in wrappers:
-        for path, arguments in wrapper.items():
-            env = import_path(path)(env, **arguments)
-    return env
-
-
-def _make(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env:
-    module, _, name = env_id.rpartition(":")
-    if module and name.isidentifier() and callable(getattr(import_module(module), name, None)):
-        env: gym.Env = import_path(env_id)(**kwargs)
-        return env
-    return gym.make(env_id, **kwargs)

@@ -13,8 +13,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.checkpoint import CHECKPOINT, write_atomically
-from benchmarks.environments import make_envs, make_wrapped
+from benchmarks.environments import make_envs
 from benchmarks.suite import RunSpec
+from sb3_gac.training.environments import make_wrapped
 
 REQUEST, EVALUATIONS = "request.json", "evaluations.csv"
 #: One mapping per evaluation: ``timesteps``, ``learner``, and others

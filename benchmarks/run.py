@@ -9,18 +9,13 @@ The directory holds ``evaluations.csv`` if and only if the run is finished.
 
 import argparse
 import dataclasses
-import os
-import platform
-import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
@@ -32,26 +27,13 @@ from benchmarks.config import POLICY, in_present_names, normalization, resolve, 
 from benchmarks.environments import EVAL_SEED, make_envs, normalized
 from benchmarks.external import Program
 from benchmarks.program import read_rows, rows_as_text
-from benchmarks.suite import HERE, RUNS, RunSpec, made_with, needed_runs, read_suite
+from benchmarks.suite import RUNS, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.base.recording import holds_every_step
 from sb3_gac.presets import instantiate
+from sb3_gac.training.provenance import provenance
 
 CONFIGURATION, MODEL = "config.yaml", "model.zip"
 STATISTICS, RECORDING = "vecnormalize.pkl", "recording.npz"
-
-
-def provenance() -> dict[str, Any]:
-    """Commit, versions and machine."""
-    git = ["git", "-C", str(HERE)]
-    commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    changed = subprocess.run([*git, "status", "--porcelain", "sb3_gac"], capture_output=True, text=True, check=False).stdout
-    packages = ("sb3_gac", "stable-baselines3", "torch", "numpy", "gymnasium", "mujoco")
-    return {
-        "commit": commit + ("+changes" if changed.strip() else ""),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in packages}},
-        "cpus": os.cpu_count(),
-        "threads": th.get_num_threads(),
-    }
 
 
 def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:

@@ -23,8 +23,8 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.run import provenance
 from sb3_gac import GAC, CheckpointError, ExactCheckpointCallback, preset
+from sb3_gac.training.provenance import provenance
 
 ENVS = 2
 MEGABYTE = 1 << 20

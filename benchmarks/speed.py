@@ -39,7 +39,7 @@ from benchmarks.models import (
 )
 from benchmarks.pixels import tabulate_image_steps, tabulate_pixels
 from benchmarks.profiles import env_step, profile_rollout, profile_step
-from benchmarks.run import provenance
+from sb3_gac.training.provenance import provenance
 
 GROWTH_CONTENDERS = ("sac", "gac", "gac-compiled")
 BLOCK, ROUNDS = 10, 9

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.run import provenance
+from sb3_gac.training.provenance import provenance
 
 HERE = Path(__file__).resolve().parent.parent
 SIZES = {"128 units, batch 128": (128, 128), "256 units, batch 256": (256, 256), "512 units, batch 256": (512, 256)}

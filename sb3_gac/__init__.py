@@ -4,6 +4,10 @@ Guided Actor-Critic for Stable-Baselines3. Importing it registers the ``sb3_gac/
 All else is imported when it is first used: :mod:`sb3_gac.learner` runs on machines that have neither torch nor gymnasium.
 """
 
+from sb3_gac.stopping import take_over
+
+take_over()  # before anything that takes time to import
+
 import warnings
 from importlib import import_module
 from importlib.util import find_spec

@@ -4,7 +4,6 @@ import json
 import re
 import shlex
 import signal
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,34 +11,48 @@ import pytest
 import torch as th
 import yaml
 
-import sb3_gac.train
 from sb3_gac import GAC, GuiderLearnerEvalCallback
-from sb3_gac.train import PartialOnly, gac_arguments, main, parse_arguments, start, summary, train
+from sb3_gac.train import main, parse_arguments
+from sb3_gac.training import evaluation, job
+from sb3_gac.training.evaluation import PartialOnly
+from sb3_gac.training.job import Job, finish, prepare
+from sb3_gac.training.options import algorithm_arguments
 
 QUICK = ["--task", "InvertedDoublePendulum", "--steps", "400", "--seed", "3", "--episodes", "2", "--envs", "2"]
 SMALL = {"learning_starts": 50, "batch_size": 8, "gradient_steps": 1, "policy_kwargs": {"net_arch": [8]}}
 
 
-def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_path):
+def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_path, capsys):
     options = ["--task", "InvertedDoublePendulum", "--noise", "0.1", "--steps", "2400", "--seed", "3", "--episodes", "2"]
-    options = parse_arguments([*options, "--runs", str(tmp_path)])
-    directory = start(options)
-    train(options, directory)
-    assert directory.parent == tmp_path
+    main([*options, "--runs", str(tmp_path)])
+    (directory,) = tmp_path.iterdir()
+    assert re.fullmatch(r"InvertedDoublePendulum-noise0\.1-history4-seed3-\d{8}-\d{6}", directory.name)
     assert {path.name for path in directory.iterdir()} == {"config.yaml", "results.json", "learning_curve.png", "model.zip"}
     assert (directory / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
     configuration = yaml.safe_load((directory / "config.yaml").read_text())
     assert (configuration["task"], configuration["noise"], configuration["seed"]) == ("InvertedDoublePendulum", 0.1, 3)
-    assert configuration["gac"]["batch_size"] == 128
+    assert configuration["environment"] == {
+        "id": "sb3_gac/InvertedDoublePendulum-v5",
+        "kwargs": {"noise_std": 0.1, "history": 4},
+        "wrappers": [],
+    }
+    arguments = configuration["arguments"]
+    assert (arguments["batch_size"], arguments["target_kl"], arguments["compile"]) == (128, 0.001, "auto"), "the preset's"
+    assert (arguments["gamma"], arguments["n_steps"], arguments["max_kl"]) == (0.99, 1, None), "and those that no one gave"
+    assert configuration["versions"].keys() >= {"python", "sb3_gac", "stable-baselines3", "torch", "gymnasium", "mujoco"}
+    assert re.match(r"[0-9a-f]{40}(\+changes)?$|$", configuration["commit"])
     results = json.loads((directory / "results.json").read_text())
     assert np.isfinite([results["learner"], results["random"]]).all()
-    assert len(results["history"]) == 10
-    last_lines = summary(directory)
-    assert f"(noise 0.1, history 4) for {results['steps']} steps" in last_lines
-    assert results["steps"] == 2400
-    assert f"return {results['learner']:.0f} +- {results['learner_std']:.0f} over 2 episodes" in last_lines
-    assert f"same seeds: {results['random']:.0f} +- {results['random_std']:.0f}." in last_lines
-    assert f'GAC.load("{directory / "model"}")' in last_lines
+    assert results["compiled"] is False
+    assert [row["timesteps"] for row in results["history"]] == list(range(240, 2401, 240))
+    output = capsys.readouterr().out
+    assert "Training for 2,400 steps: GAC on sb3_gac/InvertedDoublePendulum-v5 (noise 0.1, history 4)." in output
+    assert output.count("not compiled, for 400 are to come") == 1
+    assert len(re.findall(r"^ *[\d,]+ of 2,400 steps: learner [\d.]+, guider [\d.]+", output, re.MULTILINE)) == 10
+    assert "(noise 0.1, history 4) for 2,400 steps in" in output
+    assert f"return {results['learner']:.3g} +- {results['learner_std']:.3g} over 2 episodes" in output
+    assert f"same seeds: {results['random']:.3g} +- {results['random_std']:.3g}." in output
+    assert f'GAC.load("{directory / "model"}")' in output
     action, _ = GAC.load(directory / "model").predict({"partial": np.zeros(4 * 5 + 3, np.float32)}, deterministic=True)
     assert action.shape == (1,)
 
@@ -64,7 +77,7 @@ def test_unknown_choices_are_refused(arguments, capsys):
 
 def test_a_preset_brings_its_number_of_environments():
     options = parse_arguments(["--preset", "paper"])
-    assert gac_arguments(options)["gradient_steps"] / options.envs == 0.5, "gradient steps per environment step"
+    assert algorithm_arguments(options)["gradient_steps"] / options.envs == 0.5, "gradient steps per environment step"
     assert parse_arguments([]).envs == 4
     assert parse_arguments(["--preset", "paper", "--envs", "2"]).envs == 2
 
@@ -72,17 +85,17 @@ def test_a_preset_brings_its_number_of_environments():
 def test_robots_have_sensors_and_a_preset_of_their_own():
     options = parse_arguments(["--task", "Go1JoystickFlatTerrain"])
     assert (options.noise, options.preset, options.envs) == (0.0, "playground", 16)
-    arguments = gac_arguments(options)
+    arguments = algorithm_arguments(options)
     assert arguments["role_keys"] == {"critic": ["privileged"]}
     assert arguments["gamma"] == 0.97
-    assert gac_arguments(parse_arguments(["--task", "LeapCubeReorient"]))["gamma"] == 0.99
+    assert algorithm_arguments(parse_arguments(["--task", "LeapCubeReorient"]))["gamma"] == 0.99
     given = parse_arguments(["--task", "Go1Getup", "--noise", "0.2", "--preset", "small", "--envs", "2"])
     assert (given.noise, given.preset, given.envs) == (0.2, "small", 2)
 
 
 def test_much_noise_has_the_target_kl_of_the_figures():
-    assert gac_arguments(parse_arguments(["--noise", "0.3"]))["target_kl"] == 0.001
-    assert "target_kl" not in gac_arguments(parse_arguments(["--noise", "0.1"])), "the default"
+    assert algorithm_arguments(parse_arguments(["--noise", "0.3"]))["target_kl"] == 0.001
+    assert "target_kl" not in algorithm_arguments(parse_arguments(["--noise", "0.1"])), "the default"
 
 
 def test_what_the_learner_sees_is_a_history_where_sensors_are_noisy():
@@ -92,27 +105,16 @@ def test_what_the_learner_sees_is_a_history_where_sensors_are_noisy():
     assert parse_arguments(["--task", "Go1JoystickFlatTerrain"]).history == 1, "which takes none"
 
 
-def test_a_history_is_of_the_run_and_a_run_from_before_there_was_one_goes_on(tmp_path, monkeypatch):
-    options = parse_arguments(["--history", "4", "--runs", str(tmp_path), "--task", "Hopper"])
-    directory = start(options)
-    assert "-history4-" in directory.name
-    assert yaml.safe_load((directory / "config.yaml").read_text())["history"] == 4
-    seen = []
-
-    def learn(options, directory, env, eval_env):
-        seen.append([e.observation_space["partial"].shape[0] for e in (env, eval_env)])
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(sb3_gac.train, "learn", learn)
-    with pytest.raises(KeyboardInterrupt):
-        train(options, directory)
-    assert seen == [[4 * 5 + 3 * 3] * 2]
-    assert "history" not in start(parse_arguments(["--history", "1", "--runs", str(tmp_path)])).name
-    (directory / "config.yaml").write_text(
-        "".join(line for line in (directory / "config.yaml").read_text().splitlines(True) if not line.startswith("history"))
-    )
-    monkeypatch.setattr(sb3_gac.train, "checkpoints", lambda path: [path])
-    assert sb3_gac.train.options_of(directory).history == 1
+def test_a_history_is_of_the_run_and_a_run_from_before_there_was_one_goes_on(tmp_path):
+    ready = prepare(parse_arguments(["--history", "4", "--runs", str(tmp_path), "--task", "Hopper", "--envs", "1"]))
+    assert "-history4-" in ready.directory.name
+    for env in (ready.model.env, ready.eval_env):
+        assert env.observation_space["partial"].shape == (4 * 5 + 3 * 3,)
+    configuration = ready.directory / "config.yaml"
+    assert parse_arguments(["--resume", str(ready.directory)]).history == 4
+    configuration.write_text("".join(line for line in configuration.read_text().splitlines(True) if "history" not in line))
+    assert parse_arguments(["--resume", str(ready.directory)]).history == 1
+    assert "history" not in prepare(parse_arguments(["--history", "1", "--runs", str(tmp_path)])).directory.name
 
 
 @pytest.fixture
@@ -120,10 +122,10 @@ def _quick(monkeypatch):
     """Gradient steps from the 50th step on, of a millisecond each."""
 
     def quick(options):
-        return gac_arguments(options) | SMALL
+        return algorithm_arguments(options) | SMALL
 
-    monkeypatch.setattr(sb3_gac.train, "gac_arguments", quick)
-    monkeypatch.setattr(sb3_gac.train, "EVALUATIONS", 4)
+    monkeypatch.setattr(job, "algorithm_arguments", quick)
+    monkeypatch.setattr(job, "EVALUATIONS", 4)
 
 
 def _stopped_after(steps, by):
@@ -146,13 +148,15 @@ def test_a_run_that_is_stopped_says_how_to_go_on_and_ends_as_if_it_had_not_been(
 ):
     main([*QUICK, "--noise", "0.2", "--privileged", "velocity", "--runs", str(tmp_path / "undisturbed")])
     with monkeypatch.context() as context:
-        context.setattr(sb3_gac.train, "GuiderLearnerEvalCallback", _stopped_after(steps, by))
+        context.setattr(job, "GuiderLearnerEvalCallback", _stopped_after(steps, by))
         with pytest.raises(SystemExit) as end:
             main([*QUICK, "--noise", "0.2", "--privileged", "velocity", "--runs", str(tmp_path / "stopped")])
     assert end.value.code == status
     (directory,) = (tmp_path / "stopped").iterdir()
     assert {path.name for path in directory.iterdir()} == {"config.yaml", "checkpoints"}
-    (command,) = re.findall(r"To go on:\s+python -m sb3_gac.train (.*)", capsys.readouterr().err)
+    told = capsys.readouterr().err.strip().splitlines()
+    (command,) = re.findall(rf"^Stopped; {steps} of 400 steps are saved\. To go on: python -m sb3_gac\.train (.*)", told[-1])
+    assert len(told) == 2, "that the step is being finished, and how to go on"
     main(shlex.split(command))
     assert str(directory / "model") in capsys.readouterr().out
     (undisturbed,) = (tmp_path / "undisturbed").iterdir()
@@ -171,35 +175,68 @@ def test_a_run_that_is_stopped_says_how_to_go_on_and_ends_as_if_it_had_not_been(
 @pytest.mark.usefixtures("_quick")
 def test_minutes_are_those_of_all_processes(tmp_path, monkeypatch):
     clock = iter(range(0, 10**6, 60))  # a minute passes between any two looks at it
-    monkeypatch.setattr(sb3_gac.train, "time", SimpleNamespace(time=lambda: next(clock), strftime=time.strftime))
+    monkeypatch.setattr(job, "time", SimpleNamespace(time=lambda: next(clock)))
     with monkeypatch.context() as context:
-        context.setattr(sb3_gac.train, "GuiderLearnerEvalCallback", _stopped_after(200, signal.SIGINT))
+        context.setattr(job, "GuiderLearnerEvalCallback", _stopped_after(200, signal.SIGINT))
         with pytest.raises(SystemExit):
             main([*QUICK, "--runs", str(tmp_path)])
     (directory,) = tmp_path.iterdir()
     main(["--resume", str(directory)])
-    minutes = 2 + 2  # from the start to the checkpoint at 100 steps and to that of the stop; to that at 300 and to the end
+    # From the start to the checkpoints at 0, at 100 steps and of the stop; then to those at 300 and of the end, and to the end
+    minutes = 3 + 3
     assert json.loads((directory / "results.json").read_text())["minutes"] == minutes
 
 
 @pytest.mark.usefixtures("_quick")
-def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, monkeypatch, capsys):
-    def stopped(*arguments, **options):
+def test_a_run_that_was_stopped_before_its_first_checkpoint_starts_anew(tmp_path, monkeypatch, capsys):
+    def stopped(*arguments):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as context:
-        context.setattr(sb3_gac.train, "make_vec", stopped)
+        context.setattr(job, "learn", stopped)
+        with pytest.raises(SystemExit) as end:
+            main([*QUICK, "--runs", str(tmp_path)])
+    assert end.value.code == 130
+    (directory,) = tmp_path.iterdir()
+    message = capsys.readouterr().err.strip()
+    assert message == f"Stopped; 0 of 400 steps are saved. To go on: python -m sb3_gac.train --resume {directory}"
+    main(["--resume", str(directory)])
+    assert json.loads((directory / "results.json").read_text())["steps"] == 400
+    assert list(tmp_path.iterdir()) == [directory]
+
+
+@pytest.mark.usefixtures("_quick")
+def test_a_run_that_was_stopped_while_it_was_evaluated_is_evaluated(tmp_path, monkeypatch, capsys):
+    def stopped(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as context:
+        context.setattr(job, "evaluate", stopped)
         with pytest.raises(SystemExit):
             main([*QUICK, "--runs", str(tmp_path)])
-    assert "Stopped before there was anything to keep" in capsys.readouterr().err
     (directory,) = tmp_path.iterdir()
-    with pytest.raises(SystemExit):
-        main(["--resume", str(directory)])
-    assert f"there is no checkpoint in {directory / 'checkpoints'}" in capsys.readouterr().err
-    (directory / "results.json").write_text("{}")
-    with pytest.raises(SystemExit):
-        main(["--resume", str(directory)])
-    assert "this run is finished" in capsys.readouterr().err
+    assert "400 of 400 steps are saved. To go on" in capsys.readouterr().err
+    trained = GAC.load(directory / "model")
+    monkeypatch.setattr(GAC, "learn", stopped)
+    main(["--resume", str(directory)])
+    results = json.loads((directory / "results.json").read_text())
+    assert len(results["history"]) == 4
+    for parameter, wanted in zip(GAC.load(directory / "model").policy.parameters(), trained.policy.parameters(), strict=True):
+        assert th.equal(parameter, wanted)
+
+
+def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, capsys):
+    for content, message in {
+        None: "there is no config.yaml in it",
+        "config.yaml": "leave out --env-kwargs, --steps",
+        "results.json": "this run is finished",
+    }.items():
+        if content is not None:
+            (tmp_path / content).write_text("{}")
+        others = ["--steps", "3", "--env-kwargs", "{}"] if content == "config.yaml" else []
+        with pytest.raises(SystemExit):
+            parse_arguments(["--resume", str(tmp_path), *others])
+        assert message in capsys.readouterr().err
 
 
 def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_path, monkeypatch):
@@ -209,22 +246,22 @@ def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_pat
         asked.append((type(policy).__name__, n_eval_episodes, env.seeds.pop()))
         return {"PartialOnly": (1.0, 2.0), "UniformActions": (3.0, 4.0)}[asked[-1][0]]
 
-    model = SimpleNamespace(save=lambda path: None, num_timesteps=7)
+    model = SimpleNamespace(save=lambda path: None, num_timesteps=7, compiles=True, learning_starts=5)
     space = SimpleNamespace(seed=lambda seed: None)
-    seeds = []
+    seeds, drawn = [], []
     env = SimpleNamespace(seeds=seeds, seed=seeds.append, action_space=space, num_envs=1)
-    monkeypatch.setattr(sb3_gac.train, "evaluate_policy", evaluated)
-    monkeypatch.setattr(sb3_gac.train, "make_vec", lambda *args, **kwargs: env)
-    monkeypatch.setattr(sb3_gac.train, "learn", lambda *args: (model, [], 1.5))
-    monkeypatch.setattr(sb3_gac.train, "draw_learning_curve", lambda *args: None)
+    monkeypatch.setattr(evaluation, "evaluate_policy", evaluated)
+    monkeypatch.setattr(job, "draw_learning_curve", lambda *args: drawn.extend(args))
     (tmp_path / "checkpoints").mkdir()
-    train(parse_arguments(["--episodes", "3"]), tmp_path)
+    finish(Job(parse_arguments(["--episodes", "3"]), tmp_path, model, env), [], 1.5)
     assert asked == [("PartialOnly", 3, 10_000), ("UniformActions", 3, 10_000)]
+    assert drawn[-2:] == [3.0, 5], "what is marked: the return of random actions, and the warm-up"
     results = json.loads((tmp_path / "results.json").read_text())
     assert [results.pop(name) for name in ("learner", "learner_std", "random", "random_std")] == [1.0, 2.0, 3.0, 4.0]
-    assert results == {"steps": 7, "minutes": 1.5, "history": []}
+    assert results == {"steps": 7, "minutes": 1.5, "compiled": True, "history": []}
+    assert not (tmp_path / "checkpoints").exists()
 
 
 @pytest.mark.parametrize(("steps", "size"), [(10, 1_000), (5_000, 5_000), (10**7, 10**6)])
 def test_a_buffer_holds_the_run_within_bounds(steps, size):
-    assert gac_arguments(parse_arguments(["--steps", str(steps)]))["buffer_size"] == size
+    assert algorithm_arguments(parse_arguments(["--steps", str(steps)]))["buffer_size"] == size

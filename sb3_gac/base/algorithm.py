@@ -12,6 +12,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_gac.base.acting import BehaviourState
 from sb3_gac.base.arguments import ConstructorArguments, present_names
+from sb3_gac.base.compiling import AUTO
 from sb3_gac.base.faults import FaultTolerance
 from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
 from sb3_gac.base.hooks import EpisodeHooks
@@ -32,7 +33,6 @@ from sb3_gac.checks.arguments import (
 from sb3_gac.checks.values import plain
 from sb3_gac.networks.heads import check_action_space
 from sb3_gac.optim.coefficients import Coefficient, DualVariable, LearnedCoefficient
-from sb3_gac.optim.compile import check_can_compile
 from sb3_gac.optim.parallel import has_side_effects
 from sb3_gac.replay.source import ReplaySource
 
@@ -87,8 +87,8 @@ class AsymmetricAlgorithm(
             self.__dict__.update(as_given)  # saved as the user gave them
         side_effects = has_side_effects(self.policy)
         self._branches_are_independent = self.device.type == "cpu" and bool(self.policy.side_branch) and not side_effects
-        if self.compile:
-            self._check_can_compile(side_effects)
+        if self.compile not in (False, AUTO):
+            self.check_can_compile()
         self.coefficients = self.make_coefficients()
         self._keep_coefficients()
         self.programs = {}
@@ -112,17 +112,6 @@ class AsymmetricAlgorithm(
         rnn_type = options.get("rnn_type") or self.policy_class.default_rnn_type
         role_keys = resolve_role_keys(self.observation_space, roles, options["role_keys"])
         return any(resolve_rnn_types(roles, rnn_type, role_keys).values())
-
-    def _check_can_compile(self, side_effects: bool) -> None:
-        if side_effects:
-            raise ValueError("compile=True can't do dropout or batch normalisation: leave them out, or leave it False.")
-        check_can_compile()
-        for name, network in self.policy.trained.items():
-            if not network.can_be_compiled:
-                raise ValueError(
-                    "compile=True can do torch's Adam and AdamW, without amsgrad, foreach or fused=False, but the optimiser "
-                    f"of {name} is {type(network.optimizer).__name__}: choose another optimizer_class, or leave compile False."
-                )
 
     def _check_arguments(self) -> None:
         """
@@ -206,6 +195,7 @@ class AsymmetricAlgorithm(
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         result = super()._setup_learn(*args, **kwargs)
         self._load_frozen(needed=True)
+        self.decide_compilation()
         return result
 
     def _load_frozen(self, needed: bool) -> None:

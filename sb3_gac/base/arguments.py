@@ -26,7 +26,7 @@ class CommonArguments(TypedDict, total=False):
 
     lr_scales: Annotated[Mapping[str, float] | None, None]
     role_keys: Annotated[RoleKeys | None, None]
-    compile: Annotated[bool, False]
+    compile: Annotated[bool | str, False]
     mixed_precision: Annotated[bool, False]
     stats_window_size: Annotated[int, 100]
     tensorboard_log: Annotated[str | None, None]

@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_gac.base.resuming import ResumableAlgorithm
 from sb3_gac.checks.environments import EnvironmentFailedError
 from sb3_gac.checks.values import as_sentence
+from sb3_gac.optim.compile import is_compiling
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
@@ -23,7 +24,8 @@ class ExactCheckpointCallback(BaseCallback):
 
     On SIGTERM, as pre-empting schedulers send it, and on Ctrl-C the step is finished, a checkpoint made, and the process
     ends with a message how to go on: ``SystemExit`` with status 143, or ``KeyboardInterrupt``. A second signal gets through
-    at once, for an environment may hang. A checkpoint that can't be written, on a full disk for example, is a warning:
+    at once, for an environment may hang; so does Ctrl-C while gradient steps are being compiled, for in a terminal it ends
+    the compiler's processes as well. A checkpoint that can't be written, on a full disk for example, is a warning:
     training goes on, and the checkpoint before stays.
 
     :param directory: of the checkpoints
@@ -31,6 +33,7 @@ class ExactCheckpointCallback(BaseCallback):
     :param keep: how many of the latest ones stay
     :param notes: called for each one, makes what is to be kept with it, see ``save_checkpoint``
     :param on_signals: whether to act on SIGTERM and Ctrl-C; only the main thread can
+    :param at_start: whether to make one before the first step, so that there always is one
     :raises ValueError: if ``every`` or ``keep`` is not positive
     """
 
@@ -43,6 +46,7 @@ class ExactCheckpointCallback(BaseCallback):
         keep: int = 2,
         notes: Callable[[], Any] | None = None,
         on_signals: bool = True,
+        at_start: bool = False,
         verbose: int = 0,
     ):
         super().__init__(verbose)
@@ -54,6 +58,7 @@ class ExactCheckpointCallback(BaseCallback):
         self.keep = keep
         self.notes = notes
         self.on_signals = on_signals
+        self.at_start = at_start
         self._caught: int | None = None
         self._handlers: dict[int, Any] = {}
         self._next = 0
@@ -63,7 +68,7 @@ class ExactCheckpointCallback(BaseCallback):
             raise TypeError(f"{type(self.model).__name__} has no save_checkpoint(): use SB3's CheckpointCallback.")
 
     def _on_training_start(self) -> None:
-        self._next = self.model.num_timesteps + self.every
+        self._next = self.model.num_timesteps + (0 if self.at_start else self.every)
         self._caught = None
         if self.on_signals and threading.current_thread() is threading.main_thread():
             self._handlers = {number: signal.signal(number, self._catch) for number in _SIGNALS}
@@ -71,7 +76,7 @@ class ExactCheckpointCallback(BaseCallback):
             self.model.learn_scope.push(self._save_after_all)
 
     def _catch(self, number: int, frame: FrameType | None) -> None:
-        if self._caught is not None:
+        if self._caught is not None or (number == signal.SIGINT and is_compiling()):
             self._caught = None
             self._release_signals()
             signal.raise_signal(number)

@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self, Unpack
 
@@ -35,6 +35,7 @@ from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.episodes import EpisodeReplayBuffer, SequenceSamples, check_learns_from_sequences
 
 ENT_COEF_START = 0.1
+_EPISODE = 1_000
 ENT_COEF_BOUNDS = (1e-8, 1e4)
 
 
@@ -83,7 +84,8 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         "critic" stands for all critics: where ``privileged`` is the whole state, spare them the sensor noise with
         ``{"critic": ["privileged"]}``
     :param compile: compile losses and gradients: half a minute at the start (less the next time, from a cache), faster
-        gradient steps from then on; needs a C++ compiler on the CPU
+        gradient steps from then on; needs a C++ compiler on the CPU. "auto" decides when ``learn`` begins: where it is
+        possible, and 10,000 gradient steps or more are to come
     :param mixed_precision: matrix products of losses and gradients in bfloat16, which pays at 256 units and more on
         hardware that has it, with ``compile``
     :param stats_window_size: episodes averaged in rollout statistics
@@ -127,7 +129,7 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
         self.random_shift: int = arguments.pop("random_shift")
         self.lr_scales: Mapping[str, float] | None = arguments.pop("lr_scales")
         self.role_keys: RoleKeys | None = arguments.pop("role_keys")
-        self.compile: bool = arguments.pop("compile")
+        self.compile: bool | str = arguments.pop("compile")
         self.mixed_precision: bool = arguments.pop("mixed_precision")
         super().__init__(
             policy,
@@ -177,7 +179,7 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
             raise ValueError("recording needs a CompactDictReplayBuffer: leave replay_buffer_class out.")
         self._make_behaviour()
         if self.is_recurrent:
-            check_learns_from_sequences(self.replay_buffer_class, self.compile, self.n_steps)
+            check_learns_from_sequences(self.replay_buffer_class, self.n_steps)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
 
     def check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
@@ -387,6 +389,15 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
             )
         self._waiting = waits
         return waits
+
+    def gradient_steps_in(self, steps: int) -> int:
+        """See :meth:`Compilation.gradient_steps_in`; episodes, if they are counted, are taken for 1,000 steps long."""
+        assert isinstance(self.train_freq, TrainFreq)
+        trained = max(steps - max(int(self.learning_starts) - self.num_timesteps, 0), 0)
+        if self.gradient_steps < 0:
+            return trained
+        round_length = self.n_envs if self.train_freq.unit is TrainFrequencyUnit.STEP else _EPISODE
+        return trained * self.gradient_steps // (self.train_freq.frequency * round_length)
 
     def example_of_data(self) -> dict[str, th.Tensor]:
         """A batch of observation entries and rewards as the networks see them, for the diagnosis of a divergence."""

@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from functools import partial
+from math import ceil
 from typing import Any, ClassVar
 
 import torch as th
@@ -46,7 +47,8 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
     :param unroll_length: steps after which advantages bootstrap; ``None`` for the whole rollout
     :param lr_scales: network -> multiple of ``learning_rate``
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others
-    :param compile: compile losses and gradients; needs a C++ compiler on the CPU
+    :param compile: compile losses and gradients; needs a C++ compiler on the CPU. "auto" decides when ``learn`` begins: where
+        it is possible, and 10,000 gradient steps or more are to come
     :param mixed_precision: matrix products of losses and gradients in bfloat16
     :param stats_window_size: episodes averaged in rollout statistics
     :param tensorboard_log: log directory, ``None`` for no log
@@ -93,7 +95,7 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
         self.unroll_length: int | None = arguments.pop("unroll_length")
         self.lr_scales: Mapping[str, float] | None = arguments.pop("lr_scales")
         self.role_keys: RoleKeys | None = arguments.pop("role_keys")
-        self.compile: bool = arguments.pop("compile")
+        self.compile: bool | str = arguments.pop("compile")
         self.mixed_precision: bool = arguments.pop("mixed_precision")
         super().__init__(policy, env, use_sde=False, sde_sample_freq=-1, **arguments, _init_setup_model=False)  # type: ignore
         if sets_up:
@@ -137,6 +139,11 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
         buffer = self.rollout_buffer
         explained = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
         self.logger.record("train/explained_variance", explained)
+
+    def gradient_steps_in(self, steps: int) -> int:
+        """See :meth:`Compilation.gradient_steps_in`."""
+        rollout = self.n_steps * self.n_envs
+        return ceil(steps / rollout) * ceil(rollout / self.batch_size) * self.n_epochs
 
     def _minibatches(self) -> Iterator[DictRolloutBufferSamples]:
         for _ in range(self.n_epochs):

@@ -57,6 +57,7 @@ class ResumableAlgorithm(BaseAlgorithm):
         "ep_success_buffer",
         "strict_deployment",
         "trained_normalised",
+        "_compiles_on_auto",
     )
     #: Arguments that what a checkpoint holds was made with
     fixed_arguments: ClassVar[tuple[str, ...]] = ("policy", "policy_kwargs")
@@ -72,6 +73,8 @@ class ResumableAlgorithm(BaseAlgorithm):
     restore_data: Callable[[Path, dict[str, Any]], None]
     #: What :meth:`save_checkpoint` was given to keep, after :meth:`resume`
     resumed_notes: Any = None
+
+    _resumed: bool
 
     #: What is to be called when ``learn`` ends, in whatever way
     learn_scope: ExitStack
@@ -203,7 +206,7 @@ class ResumableAlgorithm(BaseAlgorithm):
             model.set_random_seed(model.seed)
         vars(model).update(settings)
         model._change_arguments(later)
-        model.resumed_notes = state["notes"]
+        model.resumed_notes, model._resumed = state["notes"], True
         return model
 
     def check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:

@@ -9,9 +9,9 @@ from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
+from sb3_gac.base.compiling import AUTO, Compilation
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.divergence import check_finite_metrics
 from sb3_gac.math.losses import critic_loss, masked_mean
@@ -54,7 +54,7 @@ def _scheduled(minimize: Callable[..., Metrics]) -> Callable[..., Metrics]:
     return scheduled
 
 
-class GradientSteps(BaseAlgorithm):
+class GradientSteps(Compilation):
     """
     Gradient steps of a policy's networks and coefficients: an algorithm writes one ``update``, made of ``minimize``.
 
@@ -68,7 +68,6 @@ class GradientSteps(BaseAlgorithm):
     policy: AsymmetricPolicy
     coefficients: dict[str, Coefficient]
     max_grad_norm: float | None
-    compile: bool
     mixed_precision: bool
     programs: dict[Any, Program]
     _branches_are_independent: bool
@@ -136,7 +135,7 @@ class GradientSteps(BaseAlgorithm):
             return [step.take(*own) for step, own in zip(steps, tensors, strict=True)]
 
         name, tensors = tuple(step.networks for step in steps), [step.tensors for step in steps]
-        for step, found in zip(steps, self._compiled(name, run, *tensors) if self.compile else run(*tensors), strict=True):
+        for step, found in zip(steps, self._compiled(name, run, *tensors) if self.compiles else run(*tensors), strict=True):
             step.metrics.update(found)
 
     def outputs(self, batch: Batch, *roles: str) -> list[Outputs]:
@@ -208,7 +207,8 @@ class GradientSteps(BaseAlgorithm):
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._scheduled_optimizers())
-        self.policy.refresh_parameters(self.compile)
+        self._compiles_on_auto &= not self._failed_to_compile
+        self.policy.refresh_parameters(self.compiles)
         self.refresh_schedules()
         settings = (getattr(self, name) for name in self.compiled_settings)
         self._program_key = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
@@ -225,12 +225,12 @@ class GradientSteps(BaseAlgorithm):
     @property
     def _is_one_program(self) -> bool:
         """Whether a whole update is compiled."""
-        return self.compile and self._worker is None
+        return self.compiles and self._worker is None
 
     @property
     def _in_several_programs(self) -> bool:
         """Whether each branch is compiled by itself."""
-        return self.compile and self._worker is not None
+        return self.compiles and self._worker is not None
 
     def _compiled(self, name: Any, function: Callable[..., Any], *args: Any) -> Any:
         """
@@ -241,7 +241,8 @@ class GradientSteps(BaseAlgorithm):
         """
         key = (name, self._resting, *self._program_key, *_layout(args))
         if key not in self.programs:
-            self.programs[key] = Program(function, self.device)
+            when_it_fails = self._compiling_failed if self.compile == AUTO else None
+            self.programs[key] = Program(function, self.device, when_it_fails)
         return self.programs[key](*args)
 
     def _precision(self) -> AbstractContextManager:
@@ -252,7 +253,7 @@ class GradientSteps(BaseAlgorithm):
     def refresh_schedules(self) -> None:
         """Before a round of gradient steps: put in tensors what schedules say now."""
         for coefficient in self.coefficients.values():
-            coefficient.refresh(self.compile)
+            coefficient.refresh(self.compiles)
 
     @abstractmethod
     def _scheduled_optimizers(self) -> list[th.optim.Optimizer]:

@@ -137,6 +137,14 @@ def check_switch(name: str, value: Any) -> None:
     check_choice(name, value, (False, True))
 
 
+def check_compile(name: str, value: Any) -> None:
+    """
+    :raises ValueError: unless it is true, false or "auto"
+    """
+    if value not in (False, True, "auto"):
+        raise ValueError(f'{name} must be True, False or "auto", got {value!r}.')
+
+
 def check_device(name: str, value: Any) -> None:
     """
     :raises ValueError: unless torch has such a device
@@ -184,7 +192,7 @@ COMMON_CHECKS: Mapping[str, ArgumentCheck] = {
     "max_grad_norm": unless(None, check_positive, remedy="or None for no clipping"),
     "lr_scales": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
     "role_keys": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
-    "compile": check_switch,
+    "compile": check_compile,
     "mixed_precision": check_switch,
     "stats_window_size": partial(check_integer, low=1),
     "tensorboard_log": partial(check_type, types=(str, os.PathLike, type(None)), expected="a directory or None"),

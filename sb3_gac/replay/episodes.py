@@ -218,10 +218,9 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         return result
 
 
-def check_learns_from_sequences(replay_buffer_class: type | None, compile: bool, n_steps: int) -> None:
+def check_learns_from_sequences(replay_buffer_class: type | None, n_steps: int) -> None:
     """
     :param replay_buffer_class: of an algorithm with a recurrent policy, ``None`` for the default
-    :param compile: argument of the algorithm
     :param n_steps: argument of the algorithm
     :raises ValueError: naming what does not go with a recurrent policy
     """
@@ -230,7 +229,5 @@ def check_learns_from_sequences(replay_buffer_class: type | None, compile: bool,
             f"A recurrent policy learns from sequences, but replay_buffer_class={replay_buffer_class.__name__} "
             "has none: leave it out, or give EpisodeReplayBuffer or a subclass."
         )
-    if compile:
-        raise ValueError("compile=True can't do recurrent policies: leave it False.")
     if n_steps != 1:
         raise ValueError(f"n_steps must be 1 for a recurrent policy, got {n_steps}.")

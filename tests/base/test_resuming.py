@@ -130,6 +130,7 @@ NOT_PROGRESS = {"env", "policy", "replay_buffer", "_logger", "start_time", "_vec
 NOT_PROGRESS |= {"coefficients"}  # whose tensors are compared with the networks'
 OF_RESUMING = {
     "_saved_blocks",
+    "_resumed",
     "_resumed_noise",
     "resumed_notes",
     "learn_scope",

@@ -91,7 +91,7 @@ def test_a_policy_that_rests_is_learned_from_all_the_same():
 class Uncompiled:
     """In the place of a program: what it is made of, and no compiler."""
 
-    def __init__(self, function, device):
+    def __init__(self, function, device, when_it_fails):
         self.function = function
 
     def __call__(self, *args):

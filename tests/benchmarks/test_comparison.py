@@ -132,11 +132,11 @@ def test_a_registered_task_has_its_own_settings():
 
 
 def test_gradient_steps_are_compiled_where_it_pays(monkeypatch):
-    monkeypatch.setattr(comparison.shutil, "which", lambda name: "/usr/bin/c++")
+    monkeypatch.setattr(comparison, "missing_compiler", lambda device: None)
     assert _suite("--env", "m:make", "--steps", 10_000)["overrides"]["compile"] is True
     assert "compile" not in _suite("--env", "m:make", "--steps", 9_000)["overrides"]
     assert _suite("--env", "m:make", "--overrides", "{compile: false}")["overrides"]["compile"] is False
-    monkeypatch.setattr(comparison.shutil, "which", lambda name: None)
+    monkeypatch.setattr(comparison, "missing_compiler", lambda device: "C++ compiler")
     assert "compile" not in _suite("--env", "m:make")["overrides"]
 
 

@@ -62,7 +62,7 @@ SHARED = {
     "behaviour_per": (["step", 2, None], r"behaviour_per must be one of \['environment', 'episode'\]"),
     "recording": ([3, True, ["a.npz"]], "recording must be a path or None"),
     "random_shift": ([-1, 1.5, "far", None], "random_shift must be an integer >= 0"),
-    "compile": (["yes", 2, None], r"compile must be one of \[False, True\]"),
+    "compile": (["yes", 2, None], 'compile must be True, False or "auto"'),
     "mixed_precision": (["bfloat16", 2, None], r"mixed_precision must be one of \[False, True\]"),
     "stats_window_size": ([0, -1, 1.5, None], "stats_window_size must be an integer >= 1"),
     "tensorboard_log": ([3, True], "tensorboard_log must be a directory or None"),

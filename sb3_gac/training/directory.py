@@ -1,0 +1,164 @@
+"""The directory of a run: its configuration, from which it can be taken up again, its checkpoints and its results."""
+
+import json
+import os
+import time
+from argparse import Namespace
+from collections.abc import Mapping
+from inspect import isclass, isroutine
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_gac.algorithms import algorithm_class
+from sb3_gac.checkpoint.files import checkpoints, step_of
+from sb3_gac.checks.arguments import KEPT_AS, constructor_arguments
+from sb3_gac.envs import PARTIAL
+from sb3_gac.envs.suites import SUITES, suite_of
+from sb3_gac.stopping import command
+from sb3_gac.training.evaluation import EVAL_SEED
+from sb3_gac.training.options import DEFAULTS, name_of_run, resolve
+from sb3_gac.training.provenance import provenance
+
+CONFIGURATION, CHECKPOINTS, RESULTS, MODEL = "config.yaml", "checkpoints", "results.json", "model"
+_OPTIONS = (
+    *("task", "env", "env_kwargs", "whole_state", "noise", "privileged", "history", "algorithm", "teacher", "preset"),
+    *("overrides", "steps", "seed", "envs", "compile", "episodes", "tensorboard", "runs"),
+)
+_PATHS = ("runs", "teacher")
+
+
+def options_of(directory: Path) -> Namespace:
+    """
+    :param directory: of a run that was stopped
+    :return: its options, to go on with it
+    :raises ValueError: if there is nothing to go on with
+    """
+    if (directory / RESULTS).exists():
+        raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
+    if not (directory / CONFIGURATION).exists():
+        raise ValueError(f"--resume {directory}: there is no {CONFIGURATION} in it, so it is no run's directory.")
+    configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
+    given = {name: value for name, value in configuration.items() if name in _OPTIONS and value is not None}
+    given = {name: value for name, value in given.items() if value != DEFAULTS.get(name)}
+    given |= {name: Path(given[name]) for name in _PATHS if name in given}
+    given.setdefault("history", 1)  # which runs of earlier versions had
+    if "env" in given:
+        given.pop("task", None)
+    return Namespace(**vars(resolve(given)) | {"resume": directory})
+
+
+def new_directory(options: Namespace) -> Path:
+    """
+    :param options: see :func:`resolve`
+    :return: path of a directory that there is not yet
+    """
+    path: Path = options.runs / f"{name_of_run(options)}-{time.strftime('%Y%m%d-%H%M%S')}"
+    others = (path.with_name(f"{path.name}-{number}") for number in range(2, 10_000))
+    return path if not path.exists() else next(other for other in others if not other.exists())
+
+
+def write_configuration(directory: Path, options: Namespace, model: Any) -> None:
+    """
+    All that it takes to repeat the run.
+
+    :param directory: of the run
+    :param options: see :func:`resolve`
+    :param model: that it trains, with all arguments
+    """
+    suite = suite_of(options.env_id)
+    simulators = ["gymnasium-robotics", *filter(None, [SUITES[suite].extra] if suite else [])]
+    if suite is None:
+        simulators.append(options.env_id.partition(":")[0].partition(".")[0])
+    arguments = {name: getattr(model, KEPT_AS.get(name, name)) for name in constructor_arguments(type(model))}
+    configuration = {
+        **{name: _plain(getattr(options, name)) for name in _OPTIONS},
+        "env_kwargs": _plain(_own_kwargs(options)),
+        "eval_seed": EVAL_SEED,
+        "environment": {"id": options.env_id, "kwargs": _plain(options.env_kwargs), "wrappers": options.wrappers},
+        "arguments": _plain(arguments),
+        "device": str(model.device),
+        **provenance(simulators),
+    }
+    directory.mkdir(parents=True, exist_ok=True)
+    write_at_once(directory / CONFIGURATION, yaml.safe_dump(configuration, sort_keys=False))
+
+
+def _own_kwargs(options: Namespace) -> dict[str, Any]:
+    """Of the environment: those that are no options of their own."""
+    own = () if options.task is None else ("noise_std", "privileged", "history")
+    return {name: value for name, value in options.env_kwargs.items() if name not in own}
+
+
+def _plain(value: Any) -> Any:
+    """What YAML has a form for; all else as text."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return [_plain(getattr(part, "value", part)) for part in value]
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    if isclass(value) or isroutine(value):
+        return f"{value.__module__}.{value.__qualname__}"
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def write_at_once(path: Path, text: str) -> None:
+    """
+    :param path: which has the whole text or is what it was before, whenever the process ends
+    :param text: to write
+    """
+    temporary = path.with_name(f"{path.name}.tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)
+
+
+def how_to_go_on(directory: Path, steps: int) -> str:
+    """
+    :param directory: of a run that was stopped
+    :param steps: that it is to have in the end
+    :return: how far it is, and what to do, in one line
+    """
+    if (directory / RESULTS).exists():
+        return f"The run is finished; its results are in {directory}."
+    found = checkpoints(directory / CHECKPOINTS)
+    done = f"{min(step_of(found[0]), steps) if found else 0:,} of {steps:,} steps"
+    return f"Stopped; {done} are saved. To go on: {command('--resume', str(directory))}"
+
+
+def summary(directory: Path, options: Namespace) -> str:
+    """
+    :param directory: of a finished run
+    :param options: see :func:`resolve`
+    :return: what came out, and how to use it
+    """
+    results = json.loads((directory / RESULTS).read_text())
+    name = algorithm_class(options.algorithm).__name__
+    learner, random = (f"{shown(results[key])} +- {shown(results[f'{key}_std'])}" for key in ("learner", "random"))
+    return f"""
+Trained {name} on {in_words(options)} for {results["steps"]:,} steps in {results["minutes"]:.1f} minutes.
+Learner, seeing `{PARTIAL}` alone: return {learner} over {options.episodes} episodes.
+Random actions, same seeds: {random}.
+Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:
+    from sb3_gac import {name}; model = {name}.load("{directory / MODEL}")
+    action, _ = model.predict({{"{PARTIAL}": observation}}, deterministic=True)"""
+
+
+def in_words(options: Namespace) -> str:
+    """
+    :param options: see :func:`resolve`
+    :return: the environment, with its noise and its history if it has them
+    """
+    noise = "" if options.noise is None else f"noise {options.noise:g}"
+    history = "" if options.history == 1 else f"history {options.history}"
+    details = ", ".join(filter(None, [noise, history]))
+    return f"{options.env_id} ({details})" if details else str(options.env_id)
+
+
+def shown(value: float) -> str:
+    """
+    :param value: such as a return
+    :return: in three digits, or as many as its integer part has
+    """
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -1,0 +1,184 @@
+"""The main job: train, evaluate the learner on its partial observation alone, and leave behind what came out."""
+
+import json
+import shutil
+import time
+import warnings
+from argparse import Namespace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gymnasium.error import Error as GymnasiumError
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_gac import ExactCheckpointCallback, GuiderLearnerEvalCallback, SeededEvalCallback
+from sb3_gac.algorithms import algorithm_class
+from sb3_gac.checkpoint.files import checkpoints
+from sb3_gac.stopping import when_stopped_say
+from sb3_gac.training.curve import draw_learning_curve
+from sb3_gac.training.directory import (
+    CHECKPOINTS,
+    MODEL,
+    RESULTS,
+    how_to_go_on,
+    in_words,
+    new_directory,
+    write_at_once,
+    write_configuration,
+)
+from sb3_gac.training.environments import find_modules_here, make_envs
+from sb3_gac.training.evaluation import EVAL_SEED, PartialOnly, UniformActions, evaluate
+from sb3_gac.training.options import algorithm_arguments
+from sb3_gac.training.progress import Progress
+
+EVALUATIONS = 10
+
+
+class Job(NamedTuple):
+    """
+    What is ready to be trained.
+
+    :param options: see :func:`sb3_gac.training.options.resolve`
+    :param directory: where everything is saved
+    :param model: new, or as its last checkpoint has it
+    :param eval_env: to evaluate in
+    """
+
+    options: Namespace
+    directory: Path
+    model: Any
+    eval_env: VecEnv
+
+
+def prepare(options: Namespace) -> Job:
+    """
+    Make environments and model, and a directory with the configuration.
+
+    :param options: see :func:`sb3_gac.training.options.resolve`
+    :raises ValueError: if the environment, or an argument, is wrong; then nothing was written
+    """
+    set_random_seed(options.seed)
+    env, eval_env = open_environments(options)
+    directory = options.resume or new_directory(options)
+    goes_on = bool(checkpoints(directory / CHECKPOINTS))
+    model = _resumed(options, directory, env) if goes_on else _new(options, directory, env)
+    if not goes_on:
+        write_configuration(directory, options, model)
+    when_stopped_say(lambda: how_to_go_on(directory, options.steps))
+    name = type(model).__name__
+    begins = f"Going on after {model.num_timesteps:,} of" if goes_on else "Training for"
+    print(f"{begins} {options.steps:,} steps: {name} on {in_words(options)}. Ctrl-C stops, and says how to go on.")
+    print(f"All of it is in {directory}", flush=True)
+    return Job(options, directory, model, eval_env)
+
+
+def run(job: Job) -> None:
+    """
+    :param job: to be done, or what is left of it
+    """
+    history, minutes = learn(job)
+    finish(job, history, minutes)
+
+
+def open_environments(options: Namespace) -> tuple[VecEnv, VecEnv]:
+    """
+    :param options: see :func:`sb3_gac.training.options.resolve`
+    :return: those to train in, and those to evaluate in
+    :raises ValueError: if there is no such environment, saying what was looked for
+    """
+    find_modules_here()
+    made = (options.env_id, options.env_kwargs, options.wrappers)
+    try:
+        env = make_envs(*made, options.envs, options.seed)
+        return env, make_envs(*made, min(5, options.episodes))
+    except (ImportError, GymnasiumError, ValueError) as error:
+        raise ValueError(f"{options.env_id}: {error}") from error
+
+
+def _new(options: Namespace, directory: Path, env: VecEnv) -> Any:
+    kind: Any = algorithm_class(options.algorithm)
+    log = str(directory / "tensorboard") if options.tensorboard else None
+    arguments = {"policy": "MultiInputPolicy", "tensorboard_log": log, **algorithm_arguments(options)}
+    return kind(env=env, seed=options.seed, **arguments)
+
+
+def _resumed(options: Namespace, directory: Path, env: VecEnv) -> Any:
+    kind: Any = algorithm_class(options.algorithm)
+    return kind.resume(directory / CHECKPOINTS, env)
+
+
+def learn(job: Job) -> tuple[list[dict[str, float]], float]:
+    """
+    Train to the end. There is a checkpoint of the start, of every evaluation and of the end, and one when Ctrl-C is pressed.
+
+    :param job: to be done
+    :return: the evaluations, and the minutes that it took, those of a process that was stopped included
+    """
+    options, directory, model, eval_env = job
+    every = max(options.steps // EVALUATIONS // options.envs, 1)
+    evaluation = _evaluation_class(model)(
+        eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=options.episodes, verbose=0
+    )
+    started, before, resumed = time.time(), 0.0, model.resumed_notes is not None
+    if resumed:
+        evaluation.history, before = model.resumed_notes["history"], model.resumed_notes["minutes"]
+        evaluation.n_calls = model.num_timesteps // options.envs  # evaluations are counted from the run's start
+    left = model.steps_left if resumed else options.steps
+
+    def notes() -> dict[str, Any]:
+        history = [{key: float(value) for key, value in row.items()} for row in evaluation.history]
+        return {"history": history, "minutes": before + (time.time() - started) / 60}
+
+    if left > 0:
+        root = directory / CHECKPOINTS
+        checkpoint = ExactCheckpointCallback(root, every * options.envs, notes=notes, at_start=not resumed)
+        callbacks = [evaluation, checkpoint, Progress(evaluation, options.steps)]
+        model.learn(left, callback=callbacks, reset_num_timesteps=not resumed)
+        _save_checkpoint(model, root, notes())
+    final = notes()
+    return final["history"], final["minutes"]
+
+
+def _evaluation_class(model: Any) -> type[SeededEvalCallback]:
+    return GuiderLearnerEvalCallback if hasattr(model, "predict_guider") else SeededEvalCallback
+
+
+def _save_checkpoint(model: Any, root: Path, notes: dict[str, Any]) -> None:
+    """Of the end: what is left, to evaluate and to write results, can be stopped as well."""
+    try:
+        model.save_checkpoint(root, notes=notes)
+    except OSError as error:
+        warnings.warn(f"The checkpoint of the end could not be written: {error}", stacklevel=2)
+
+
+def finish(job: Job, history: list[dict[str, float]], minutes: float) -> None:
+    """
+    Save the model, evaluate it, and write down what came out; then there is nothing left to go on with.
+
+    :param job: whose model is trained
+    :param history: its evaluations
+    :param minutes: that training took
+    """
+    options, directory, model, eval_env = job
+    model.save(directory / MODEL)
+    learner, learner_std = evaluate(PartialOnly(model), eval_env, options.episodes)
+    random, random_std = evaluate(UniformActions(eval_env), eval_env, options.episodes)
+    warm_up = getattr(model, "learning_starts", 0)
+    draw_learning_curve(history, _title(options, model), directory / "learning_curve.png", random, warm_up)
+    results = {
+        "learner": learner,
+        "learner_std": learner_std,
+        "random": random,
+        "random_std": random_std,
+        "steps": model.num_timesteps,
+        "minutes": minutes,
+        "compiled": model.compiles,
+        "history": history,
+    }
+    write_at_once(directory / RESULTS, json.dumps(results, indent=1))
+    shutil.rmtree(directory / CHECKPOINTS)
+
+
+def _title(options: Namespace, model: Any) -> str:
+    return f"{type(model).__name__} on {in_words(options)}"

@@ -1,0 +1,157 @@
+"""What the command line of the main job takes, and what becomes of what it leaves out."""
+
+import re
+import sys
+
+import gymnasium as gym
+import pytest
+import yaml
+from gymnasium import spaces
+
+from sb3_gac.algorithms import ALGORITHMS
+from sb3_gac.envs import PARTIAL
+from sb3_gac.train import parse_arguments
+from sb3_gac.training.directory import new_directory
+from sb3_gac.training.environments import find_modules_here
+from sb3_gac.training.job import open_environments, prepare
+from sb3_gac.training.options import DEFAULTS, algorithm_arguments, make_parser
+from tests.helpers import TwoViewBandit
+
+OWN = "tests.training.test_options:make_own"
+
+
+def make_own(mass=1.0):
+    """An environment of one's own."""
+    env = TwoViewBandit()
+    env.mass = mass
+    return env
+
+
+def make_foreign():
+    """One whose observations are none of ours."""
+    return gym.make("CartPole-v1")
+
+
+def test_help_has_the_defaults_and_needs_no_more_than_80_columns(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = " ".join(make_parser().format_help().split())
+    for name, value in DEFAULTS.items():
+        if value and value is not True:
+            assert f"(default: {value}" in text, name
+    assert text.count("(default: ") == len(make_parser()._actions) - len({"help", "resume", "env", "teacher"})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", OWN, "--task", "Hopper"], "--task and --env: give one of them"),
+        (["--env", OWN, "--noise", "0.1"], "--noise: an environment of one's own has its arguments in --env-kwargs"),
+        (["--task", "Hopper", "--whole-state"], "--whole-state: whether privileged is the whole state"),
+        (["--env", "sb3_gac/TigerDoor-v0", "--noise", "0.1"], "--noise: sb3_gac/TigerDoor-v0 has no such argument"),
+        (["--noise", "0.1", "--env-kwargs", "{noise_std: 0.2}"], "--env-kwargs and --noise say different things"),
+        (["--task", "Go1Getup", "--history", "2"], "--history: Go1Getup takes none"),
+        (["--algorithm", "cosil"], "give --teacher runs/<its directory>/model.zip"),
+        (["--algorithm", "tgrl", "--teacher", "nowhere.zip"], "--teacher: there is no file nowhere.zip"),
+        (["--teacher", "model.zip"], "--teacher: GAC has none"),
+        (["--steps", "0"], "--steps: must be an integer of at least 1, got 0"),
+        (["--steps", "1e4"], "--steps: must be an integer of at least 1, got 1e4"),
+        (["--env-kwargs", "3"], "must be a mapping"),
+        (["--overrides", "{"], "is no YAML"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_by_name(arguments, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        parse_arguments(arguments)
+    assert end.value.code == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_compiling_is_decided_by_the_run_unless_it_is_said():
+    given = {(): "auto", ("--compile",): True, ("--compile", "no"): False, ("--compile", "auto"): "auto"}
+    for arguments, expected in given.items():
+        assert algorithm_arguments(parse_arguments(list(arguments)))["compile"] == expected
+
+
+@pytest.mark.parametrize("algorithm", sorted(set(ALGORITHMS) - {"cosil", "tgrl"}))
+def test_every_algorithm_without_a_teacher_can_be_made(algorithm, tmp_path):
+    job = prepare(parse_arguments(["--env", OWN, "--algorithm", algorithm, "--runs", str(tmp_path)]))
+    assert job.directory.name.startswith("make_own-seed0-" if algorithm == "gac" else f"{algorithm}-make_own-seed0-")
+    assert parse_arguments(["--resume", str(job.directory)]).algorithm == algorithm
+
+
+def test_a_teacher_is_the_file_of_another_run(tmp_path):
+    prepare(parse_arguments(["--env", OWN, "--runs", str(tmp_path)])).model.save(tmp_path / "teacher.zip")
+    arguments = ["--env", OWN, "--algorithm", "cosil", "--teacher", str(tmp_path / "teacher.zip"), "--runs", str(tmp_path)]
+    job = prepare(parse_arguments(arguments))
+    assert job.model.teacher == str(tmp_path / "teacher.zip")
+    assert str(parse_arguments(["--resume", str(job.directory)]).teacher) == job.model.teacher
+
+
+def test_an_environment_of_ones_own_has_its_arguments_and_a_history_on_request(tmp_path):
+    arguments = ["--env", OWN, "--env-kwargs", "{mass: 2.5}", "--history", "3", "--overrides", "{gamma: 0.5}"]
+    job = prepare(parse_arguments([*arguments, "--tensorboard", "--runs", str(tmp_path)]))
+    single = TwoViewBandit()
+    n_actions, width = single.action_space.shape[0], single.observation_space[PARTIAL].shape[0]
+    assert job.model.observation_space[PARTIAL].shape == (3 * width + 2 * n_actions,)
+    assert job.model.env.get_attr("mass") == [2.5] * 4
+    assert job.model.gamma == 0.5
+    assert job.model.role_keys is None, "privileged need not be the whole state"
+    assert job.model.tensorboard_log == str(job.directory / "tensorboard")
+    again = parse_arguments(["--resume", str(job.directory)])
+    assert (again.env_id, again.env_kwargs, again.history, again.tensorboard) == (OWN, {"mass": 2.5}, 3, True)
+    configuration = yaml.safe_load((job.directory / "config.yaml").read_text())
+    assert configuration["environment"]["kwargs"] == {"mass": 2.5}
+    assert configuration["arguments"]["gamma"] == 0.5
+
+
+def test_critics_see_the_whole_state_alone_where_privileged_is_said_to_be_it():
+    options = parse_arguments(["--env", OWN, "--whole-state"])
+    assert algorithm_arguments(options)["role_keys"] == {"critic": ["privileged"]}
+
+
+def test_one_of_this_packages_environments_is_a_task_by_its_id():
+    by_id = parse_arguments(["--env", "sb3_gac/Hopper-v5", "--env-kwargs", "{noise_std: 0.3, reset_noise_scale: 0.1}"])
+    assert (by_id.task, by_id.noise, by_id.history) == ("Hopper", 0.3, 4)
+    assert by_id.env_kwargs == {"noise_std": 0.3, "history": 4, "reset_noise_scale": 0.1}
+    assert algorithm_arguments(by_id)["role_keys"] == {"critic": ["privileged"]}
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("no_such_module:Env-v0", "no_such_module"),
+        ("NoSuch-v0", "NoSuch"),
+        ("tests.training.test_options:Nothing-v0", "Nothing"),
+    ],
+)
+def test_an_environment_that_there_is_not_is_named(env_id, message, tmp_path):
+    with pytest.raises(ValueError, match=rf"^{re.escape(env_id)}: .*{message}"):
+        open_environments(parse_arguments(["--env", env_id]))
+
+
+def test_nothing_is_written_for_an_environment_with_other_observations(tmp_path):
+    arguments = ["--env", "tests.training.test_options:make_foreign", "--runs", str(tmp_path)]
+    with pytest.raises((ValueError, TypeError), match=r"(?i)dict"):
+        prepare(parse_arguments(arguments))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_runs_of_the_same_second_have_directories_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_gac.training.directory.time.strftime", lambda format: "now")
+    options = parse_arguments(["--runs", str(tmp_path)])
+    for ending in ("now", "now-2", "now-3"):
+        directory = new_directory(options)
+        assert directory.name == f"HalfCheetah-noise0.1-history4-seed0-{ending}"
+        directory.mkdir()
+
+
+def test_a_console_script_finds_modules_in_the_working_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["/elsewhere"])
+    for _ in range(2):
+        find_modules_here()
+    assert sys.path == [str(tmp_path), "/elsewhere"]
+
+
+def test_the_spaces_of_the_bandit_are_what_these_tests_take_them_for():
+    assert isinstance(TwoViewBandit().observation_space, spaces.Dict)
