@@ -17,6 +17,7 @@ from benchmarks.suite import RunSpec, check_is, check_keys, check_numbers, neede
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.base.arguments import present_names
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.envs.suites import SUITES, suite_of
 from sb3_gac.presets import instantiate, merge, read_preset
 
 POLICY = "MultiInputPolicy"
@@ -93,6 +94,19 @@ def check_programs(specs: Iterable[RunSpec]) -> None:
                 kind(**arguments).versions()
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from None
+
+
+def check_simulators(specs: Iterable[RunSpec]) -> None:
+    """
+    Whether the simulators of registered tasks are installed.
+
+    :param specs: the runs' settings
+    :raises ValueError: naming a task whose simulator is missing, and how to install it
+    """
+    for spec in {spec.task: spec for spec in specs if spec.environment is None}.values():
+        suite = suite_of(environment(spec)[0])
+        if suite is not None and not SUITES[suite].is_installed:
+            raise ValueError(SUITES[suite].how_to_install(spec.task))
 
 
 def try_out(where: str, spec: RunSpec) -> None:

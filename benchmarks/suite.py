@@ -144,7 +144,10 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
     :return: its runs, by entry of its ``cells`` and noise
     :raises ValueError: if a key is unknown or missing, or a run is listed twice
     """
-    suite = yaml.safe_load(path.read_text())
+    try:
+        suite = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path.name} is not YAML: {error}") from None
     check_is(path.name, suite, "a mapping", Mapping)
     if "preset" in suite:
         suite = {**read_preset(suite["preset"]).run, **suite}

@@ -19,7 +19,8 @@ try:
     import onnxruntime
 except ImportError as error:
     raise ImportError(
-        'sb3_gac.learner needs onnxruntime: on the robot pip install onnxruntime, in the clone pip install -e ".[export]".'
+        "sb3_gac.learner needs onnxruntime: pip install onnxruntime on the robot; elsewhere the extra sb3_gac[export] has it: "
+        'pip install -e ".[export]" in the clone of sb3_gac.'
     ) from error
 
 METADATA_KEY = "sb3_gac"

@@ -21,6 +21,7 @@ from sb3_gac.checks.entries import computable
 from sb3_gac.checks.values import check_positive, index_bounds
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import check_agreement, draw_observations
+from sb3_gac.envs.suites.extras import missing_extra
 from sb3_gac.networks.actors import DeployedPolicy
 from sb3_gac.networks.recurrent import Memory
 from sb3_gac.version import __version__
@@ -233,9 +234,7 @@ def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
         import onnx
         import onnxruntime  # noqa: F401, with which the file is compared
     except ImportError as error:
-        raise ImportError(
-            f'A file for ONNX needs onnx and onnxruntime ({error}): pip install -e ".[export]" in the clone.'
-        ) from error
+        raise missing_extra("A file for ONNX", error.name or "onnx and onnxruntime", "export") from error
 
     remembers = module.memory is not None
     inputs = [*module.keys, *[module.state_name] * remembers]

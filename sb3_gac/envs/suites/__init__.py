@@ -23,6 +23,8 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 
+from sb3_gac.envs.suites.extras import missing_extra
+
 
 class Suite(NamedTuple):
     """
@@ -57,6 +59,15 @@ class Suite(NamedTuple):
         """Whether its simulator is there; it is not imported."""
         module = self.simulator or self.extra
         return module is None or find_spec(module) is not None
+
+    def how_to_install(self, user: str) -> str:
+        """
+        :param user: what can't be made without the simulator, such as a task
+        :return: a sentence that says what is missing
+        """
+        if self.extra is None:
+            return f"{user} needs {self.simulator}, which no package index has: docs/environments.md says how to install it."
+        return str(missing_extra(user, self.simulator or self.extra, self.extra))
 
     def shows_whole_state(self, env_id: str) -> bool:
         """
