@@ -83,8 +83,8 @@ class Overview:
         cells = [list(jobs) for _, jobs in groupby(sorted(self._in_state("finished"), key=_cell), key=_cell)]
         for jobs in sorted(cells, key=lambda jobs: max(job.ended for job in jobs), reverse=True):
             returns = (_in_digits(last_evaluation(job)[1]) or "?" for job in sorted(jobs, key=lambda job: job.spec.seed))
-            steps = (jobs[0].spec.steps, jobs[0].spec.steps)
-            yield Row(*_cell(jobs[0]), f"{len(jobs)} finished", steps, ", ".join(returns))
+            whole = jobs[0].spec.steps
+            yield Row(*_cell(jobs[0]), f"{len(jobs)} finished", (whole, whole), ", ".join(returns))
 
     def _in_state(self, *states: str) -> list[Job]:
         """Those in the first of the states first."""
