@@ -117,7 +117,7 @@ def export_learner(
     for its use.
 
     :param model: trained
-    :param path: with the suffix ".onnx", or ".pt" for TorchScript
+    :param path: with the suffix ".onnx", or ".pt" for TorchScript; folders that are not there are made
     :param normalizer: of the observations; by default that of the model's ``VecNormalize``, if it has one
     :param units: entry, or "action" -> unit, kept in the file's metadata
     :param verify_on: number of observations to compare the file's actions and those of ``predict`` on, see
@@ -135,6 +135,7 @@ def export_learner(
     normalizer = _normalizer_of(model) if normalizer is None else normalizer
     module = DeployedModule(deepcopy(model.policy.deployed), normalizer).cpu().eval().requires_grad_(False)
     metadata = json.dumps(describe(module, type(model).__name__, units or {}), allow_nan=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with th.no_grad(), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as directory:
         written = Path(directory) / path.name
         WRITERS[path.suffix](module, written, metadata)
