@@ -2,6 +2,8 @@
 
 from importlib.util import find_spec
 
+from sb3_gac.envs.suites.extras import missing_extra
+
 _EXTRA = ("pandas", "plotly", "rliable", "tensorboard")
 
 
@@ -13,4 +15,4 @@ def _lacks(name: str) -> bool:
 
 
 if _missing := [name for name in _EXTRA if _lacks(name)]:
-    raise ImportError(f'The benchmarks need {", ".join(_missing)}: pip install -e ".[benchmarks]" installs them.')
+    raise missing_extra("A benchmark", ", ".join(_missing), "benchmarks")

@@ -16,7 +16,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from benchmarks import aggregate, launch
 from benchmarks.comparison_page import page
-from benchmarks.config import check_programs
+from benchmarks.config import check_programs, check_simulators
 from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.finished import read_tidy
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, findings, recommendation, worth
@@ -167,11 +167,12 @@ def run(options: argparse.Namespace) -> Path:
     os.environ["PYTHONPATH"] = os.pathsep.join([os.getcwd(), *filter(None, [os.environ.get("PYTHONPATH")])])
     jobs, finished = launch.jobs_left(suite, runs)
     check_programs(job.spec for job in jobs)
+    check_simulators(job.spec for job in jobs)
     print(f"{len(jobs)} runs of {options.steps:,} steps to do, {finished} done; all is in {options.out}.", flush=True)
     engine = launch.LocalEngine() if options.ray is None else launch.RayEngine(options.ray)
-    launch.launch(jobs, options.jobs or engine.cpus, 1, engine)
+    launch.launch(jobs, options.jobs or engine.cpus, 1, engine, finished)
     if failed := [job for job in jobs if job.state == "failed"]:
-        logs = "\n".join(f"  {job.log}" for job in failed)
+        logs = "\n".join(f"  {job.log}: {job.reason}" for job in failed)
         raise ValueError(f"{len(failed)} runs failed. Their logs say why; then the same command goes on:\n{logs}")
     return write_results(options, suite, runs)
 

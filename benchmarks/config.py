@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.environments import environment, make_envs, normalized
 from benchmarks.external import Program
@@ -17,6 +18,7 @@ from benchmarks.suite import RunSpec, check_is, check_keys, check_numbers, neede
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.base.arguments import present_names
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.envs.suites import SUITES, is_batched, suite_of
 from sb3_gac.presets import instantiate, merge, read_preset
 
 POLICY = "MultiInputPolicy"
@@ -59,12 +61,13 @@ def normalization(spec: RunSpec) -> dict[str, Any] | None:
 
 def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
     """
-    Whether runs can be made, as far as can be told at once. Environments that are no registered tasks are tried out.
+    Whether runs can be made, as far as can be told at once. Each algorithm is made with its arguments, and environments that
+    are no registered tasks are tried out.
 
     :param where: the suite, for the message
-    :param specs: of its runs
+    :param specs: the settings of its runs
     :raises ValueError: naming an algorithm, a task or an argument that there is not, a number that YAML reads as text, or what
-        an algorithm says of an environment
+        an algorithm says of an argument or an environment
     """
     kinds = {(spec.algorithm, spec.cell): spec for spec in with_needed(specs)}
     for spec in kinds.values():
@@ -74,9 +77,60 @@ def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
             normalization(spec)
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
+    _check_values(where, kinds.values())
     for spec in kinds.values():
         if spec.environment is not None:
             try_out(where, spec)
+
+
+def _check_values(where: str, specs: Iterable[RunSpec]) -> None:
+    """Make an algorithm of each class and set of arguments on one of the registered tasks that it is to train on."""
+    made: set[tuple[type, str]] = set()
+    for spec in specs:
+        kind, arguments = resolve(spec)
+        is_new = (kind, repr(arguments)) not in made
+        if not is_new or spec.environment is not None or not can_be_made(spec, kind) or is_batched(environment(spec)[0]):
+            continue
+        made.add((kind, repr(arguments)))
+        try:
+            env = normalized(make_envs(spec, 1, spec.seed), normalization(spec))
+        except Exception:  # such as a missing simulator, which a dry run need not have
+            continue
+        try:
+            make_small(kind, arguments, env, spec.seed)
+        except Exception as error:
+            said = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            raise ValueError(f"{where}: {spec.cell}, {spec.algorithm}: {said}") from error
+        finally:
+            env.close()
+
+
+def can_be_made(spec: RunSpec, kind: type) -> bool:
+    """
+    :param spec: the settings of a run
+    :param kind: class of its algorithm
+    :return: whether the algorithm can be made before any run, without another run's model, in this process
+    """
+    return spec.needs is None and not issubclass(kind, Program)
+
+
+def make_small(kind: type, arguments: Mapping[str, Any], env: VecEnv, seed: int) -> Any:
+    """
+    :param kind: class of an algorithm
+    :param arguments: as YAML has them
+    :param env: to train on
+    :param seed: of the algorithm
+    :return: a model that needs little memory, and takes no gradient step in its first thousands of steps
+    """
+    small = {"buffer_size": 1_000, "learning_starts": 10**9, "n_epochs": 1}
+    known = constructor_parameters(kind)
+    given = {name: arguments.get(name, value) for name, value in small.items() if name in known}
+    small = {name: small[name] for name, value in given.items() if _is_count(value)}  # others are the algorithm's to refuse
+    return kind(env=env, device="cpu", **{"policy": POLICY, **instantiate({**arguments, **small}), "seed": seed})
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
 def check_programs(specs: Iterable[RunSpec]) -> None:
@@ -95,6 +149,19 @@ def check_programs(specs: Iterable[RunSpec]) -> None:
                 raise ValueError(f"{name}: {error}") from None
 
 
+def check_simulators(specs: Iterable[RunSpec]) -> None:
+    """
+    Whether the simulators of registered tasks are installed.
+
+    :param specs: the runs' settings
+    :raises ValueError: naming a task whose simulator is missing, and how to install it
+    """
+    for spec in {spec.task: spec for spec in specs if spec.environment is None}.values():
+        suite = suite_of(environment(spec)[0])
+        if suite is not None and not SUITES[suite].is_installed:
+            raise ValueError(SUITES[suite].how_to_install(spec.task))
+
+
 def try_out(where: str, spec: RunSpec) -> None:
     """
     Make a run's environment, and on it, unless it needs another run first, its algorithm, which takes one step.
@@ -106,12 +173,9 @@ def try_out(where: str, spec: RunSpec) -> None:
     try:
         env = normalized(make_envs(spec, min(spec.envs, 2), spec.seed), normalization(spec))
         try:
-            if spec.needs is None and not issubclass(resolve(spec)[0], Program):
-                kind, arguments = resolve(spec)
-                small = {"buffer_size": 1_000, "learning_starts": 10**9, "n_epochs": 1}
-                known = constructor_parameters(kind)
-                arguments |= {name: value for name, value in small.items() if name in known}
-                model = kind(env=env, device="cpu", **{"policy": POLICY, **instantiate(arguments), "seed": spec.seed})
+            kind, arguments = resolve(spec)
+            if can_be_made(spec, kind):
+                model = make_small(kind, arguments, env, spec.seed)
                 model.set_logger(Logger(None, []))
                 model.learn(1)
         finally:

@@ -22,6 +22,7 @@ import torch as th
 from gymnasium import spaces
 
 from benchmarks.program import Request
+from sb3_gac.envs.suites.extras import missing_extra
 
 try:
     from omegaconf import OmegaConf
@@ -31,7 +32,7 @@ try:
     from sheeprl.utils import fs
     from sheeprl.utils.utils import dotdict
 except ImportError as error:
-    raise ImportError(f'benchmarks.dreamer needs sheeprl ({error}): pip install -e ".[dreamer]" in the clone.') from None
+    raise missing_extra("benchmarks.dreamer", error.name or "sheeprl", "dreamer") from None
 
 SIZES = ("1M", "12M", "25M", "50M", "100M", "200M", "400M")
 KEY = "partial"

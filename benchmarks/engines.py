@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.suite import HERE
+from sb3_gac.envs.suites.extras import missing_extra
 
+#: Begins the line of a log before an attempt's output
+ATTEMPT = "--- attempt: "
 NODE_LOSSES = 10
 _PR_SET_PDEATHSIG = 1
 _prctl: Any = ctypes.CDLL(None).prctl if sys.platform == "linux" else None  # elsewhere runs outlive a killed launch
@@ -25,7 +28,7 @@ def run_process(command: list[str], log: Path) -> int:
     :return: exit status
     """
     with log.open("a") as file:
-        file.write(f"--- attempt: {shlex.join(command)}\n")
+        file.write(f"{ATTEMPT}{shlex.join(command)}\n")
         file.flush()
         return subprocess.run(
             command,
@@ -65,8 +68,8 @@ class RayEngine:
     def __init__(self, address: str):
         try:
             import ray
-        except ImportError:
-            raise ImportError('--engine ray needs Ray: pip install -e ".[ray]" in the clone.') from None
+        except ImportError as error:
+            raise missing_extra("--engine ray", error.name or "ray", "ray") from None
         path = [str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(path)}}
         ray.init(address, log_to_driver=False, runtime_env=environment, ignore_reinit_error=True)

@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.suite import RunSpec
 from sb3_gac.envs import make_vec
-from sb3_gac.envs.suites import SUITES, suite_of, task_of
+from sb3_gac.envs.suites import SUITES, env_id_of, suite_of, task_of
 from sb3_gac.training.environments import make_envs as make_any_envs
 
 #: Of the environments of every evaluation
@@ -23,17 +22,17 @@ def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
     """
     if spec.environment is not None:
         return spec.environment["id"], spec.environment["kwargs"]
-    ids = {task_of(name): name for name in gym.registry if name.startswith("sb3_gac/")}
-    if spec.task not in ids:
-        raise ValueError(f"task must be one of the registered sb3_gac/<task>-v<version>, {sorted(ids)}, got {spec.task!r}.")
-    suite = suite_of(ids[spec.task])
+    env_id = env_id_of(spec.task)
+    if spec.task != task_of(env_id):  # directories and tables have its name
+        raise ValueError(f"task must be the name {task_of(env_id)!r}, got {spec.task!r}.")
+    suite = suite_of(env_id)
     takes_noise = suite is None or SUITES[suite].sensor_noise
     if spec.noise and not takes_noise:
         raise ValueError(f"{spec.task} has no sensor noise: give noises: [0].")
     if spec.history and not (suite is None or SUITES[suite].history):
         raise ValueError(f"{spec.task} takes no history: leave it out, and give networks a memory.")
     history = {} if spec.history is None else {"history": spec.history}
-    return ids[spec.task], {"noise_std": spec.noise, **history} if takes_noise else {}
+    return env_id, {"noise_std": spec.noise, **history} if takes_noise else {}
 
 
 def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:

@@ -4,74 +4,37 @@ A suite -> its runs, several side by side with one thread each::
     python -m benchmarks.launch benchmarks/suites/halfcheetah.yml --jobs 2
 
 Finished runs are skipped and unfinished ones go on from their checkpoints, so an interrupted launch is resumed by the same
-command; runs whose directories are elsewhere, or gone, count as finished if ``--reuse-results`` have them.  A failed run is
-tried again.  What a run needs another run's model for comes first, once for all that need it; where that fails, they are not
-started.  ``--dry-run`` prints the commands of what is left to do.  ``--engine ray`` runs on a Ray cluster whose nodes
-share this checkout, its Python and the runs' directory.
+command; runs whose directories are elsewhere, or gone, count as finished if ``--reuse-results`` have them.  The whole suite is
+checked before the first run.  A failed run is tried again, and its reason is told.  What a run needs another run's model for
+comes first, once for all that need it; where that fails, they are not started.  ``--dry-run`` prints the commands of what is
+left to do, and counts them.  ``--engine ray`` runs on a Ray cluster whose nodes share this checkout, its Python and the runs'
+directory.
 """
 
 import argparse
-import json
 import os
 import shlex
 import sys
-from collections import Counter
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
-from benchmarks.config import check_programs, check_runs
+from benchmarks.config import check_programs, check_runs, check_simulators
 from benchmarks.engines import Engine, LocalEngine, RayEngine
 from benchmarks.finished import add_reuse_options, name_of, read_reused
+from benchmarks.jobs import Clock, Job, reason_in
+from benchmarks.overview import Overview, line, table, why_not_started
 from benchmarks.run import file_for
 from benchmarks.suite import RUNS, RunSpec, needed_runs, read_suite
 
-COLUMNS = ("task", "noise", "algorithm", "seed", "state", "steps", "return")
-STATES = ("waiting", "running", "finished", "not started", "failed")
-_ENDED_BADLY = ("not started", "failed")
-_FRAME = 6  # lines that are no runs: borders, names of columns, how many there are, and one of the terminal's own
-
-
-@dataclass
-class Job:
-    """
-    A run that is left to do.
-
-    :param spec: of the run
-    :param directory: of the run
-    :param command: to run it
-    :param state: one of ``STATES``
-    :param needs: jobs that must be finished before
-    """
-
-    spec: RunSpec
-    directory: Path
-    command: list[str]
-    state: str = "waiting"
-    needs: list["Job"] = field(default_factory=list)
-
-    @property
-    def lacking(self) -> list["Job"]:
-        """Those that it needs, and that will never be finished."""
-        return [job for job in self.needs if job.state in _ENDED_BADLY]
-
-    @property
-    def is_ready(self) -> bool:
-        """Whether nothing that it needs is still to come."""
-        return all(job.state not in ("waiting", "running") for job in self.needs)
-
-    @property
-    def log(self) -> Path:
-        """Where the run's output goes, that of all attempts."""
-        return self.directory / "log.txt"
+__all__ = ["Job", "in_order", "jobs_left", "launch", "launch_one", "run_command", "table"]
 
 
 def jobs_left(suite: Path, runs: Path, reuse: Sequence[Path] = (), rerun: Sequence[str] = ()) -> tuple[list[Job], int]:
@@ -129,101 +92,34 @@ def run_command(suite: Path, index: int, runs: Path, needed: Sequence[str] = ())
 
 def launch_one(job: Job, retries: int, engine: Engine, tell: Callable[[Job], None]) -> None:
     """
-    :param job: to run in a process of its own with one thread; its state says how it ended
+    :param job: to run in a process of its own with one thread; its state says how it ended, and its reason why
     :param retries: further attempts after one that failed
     :param engine: where
-    :param tell: called when the state has changed
+    :param tell: called when the state has changed, and before another attempt
     """
-    job.directory.mkdir(parents=True, exist_ok=True)
-    job.state = "running"
+    job.state, job.reason = "running", ""
     tell(job)
-    done = any(engine.run(job.command, job.log) == 0 for _ in range(retries + 1))
-    job.state = "finished" if done else "failed"
+    for left in reversed(range(retries + 1)):
+        job.reason = _why_failed(job, engine)
+        if not job.reason:
+            break
+        if left:
+            tell(job)
+    job.state, job.ended = "failed" if job.reason else "finished", time.monotonic()
     tell(job)
 
 
-def progress(job: Job) -> tuple[str, str]:
-    """
-    :param job: in any state
-    :return: steps of its last evaluation and the learner's return there, as far as there was one
-    """
+def _why_failed(job: Job, engine: Engine) -> str:
+    """Run it once; empty, if that went well. Whatever an engine or a file system raises is the failure of this run alone."""
     try:
-        last = json.loads((job.directory / "timing.json").read_text())
-        return f"{last['steps']} / {job.spec.steps}", f"{last['learner']:.1f}"
-    except (OSError, ValueError, KeyError):
-        return (f"0 / {job.spec.steps}", "") if job.state == "running" else ("", "")
+        job.directory.mkdir(parents=True, exist_ok=True)
+        status = engine.run(job.command, job.log)
+        return reason_in(job.log, status) if status else ""
+    except Exception as error:
+        return f"{type(error).__name__}: {error}".rstrip(": ")
 
 
-def count(jobs: Sequence[Job]) -> str:
-    """
-    :param jobs: of this launch
-    :return: how many are in each state
-    """
-    states = Counter(job.state for job in jobs)
-    return ", ".join(f"{states[state]} {state}" for state in reversed(STATES) if states[state] or state not in _ENDED_BADLY)
-
-
-class Overview:
-    """
-    A table as high as the terminal allows, made anew from the jobs' states whenever it is drawn: all those that run, as many
-    of those that failed as there is room for, then of those that finished last. Below it, how many there are of each.
-
-    :param jobs: of this launch
-    """
-
-    def __init__(self, jobs: Sequence[Job]):
-        self._jobs = jobs
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Called by rich."""
-        shown = self.shown(max((options.height or console.height) - _FRAME, 1))
-        result = Table(*COLUMNS)
-        for column in result.columns:
-            column.no_wrap = True
-        for job in shown:
-            spec = job.spec
-            noise = "" if spec.noise is None else f"{spec.noise:g}"
-            result.add_row(spec.title, noise, spec.algorithm, str(spec.seed), job.state, *progress(job))
-        yield result
-        hidden = sum(job.state != "waiting" for job in self._jobs) - len(shown)
-        yield Text(count(self._jobs) + (f"; {hidden} of them not shown" if hidden else ""), no_wrap=True, overflow="ellipsis")
-
-    def shown(self, rows: int) -> list[Job]:
-        """
-        :param rows: that there are
-        :return: the jobs in them, the most important ones last
-        """
-        jobs = [job for state in ("finished", *_ENDED_BADLY, "running") for job in self._jobs if job.state == state]
-        return jobs[-rows:]
-
-
-def table(jobs: Sequence[Job]) -> Overview:
-    """
-    :param jobs: of this launch
-    :return: for a terminal
-    """
-    return Overview(jobs)
-
-
-def print_line(jobs: Sequence[Job], job: Job) -> None:
-    """
-    For a log, where a table can't be drawn anew.
-
-    :param jobs: of this launch
-    :param job: one of them, whose state has changed
-    """
-    steps, value = progress(job) if job.state != "running" else ("", "")
-    reached = f", {steps} steps, return {value}" if steps else ""
-    print(f"{name_of(job.spec)}: {job.state}{reached}{_reason(job)} ({count(jobs)})", flush=True)
-
-
-def _reason(job: Job) -> str:
-    """Why a job was not started."""
-    verbs = {"failed": "failed", "not started": "was not started"}
-    return "".join(f", for it needs {name_of(other.spec)}, which {verbs[other.state]}" for other in job.lacking)
-
-
-def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine) -> None:
+def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine, finished_before: int = 0) -> None:
     """
     Ctrl-C ends all runs at once, which then have their checkpoints, and with them this process.
 
@@ -231,12 +127,22 @@ def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine) -> None:
     :param at_once: how many side by side
     :param retries: further attempts after one that failed
     :param engine: where
+    :param finished_before: runs of the suite that need not be made
     """
-    console = Console()
-    tell = (lambda job: None) if console.is_terminal else partial(print_line, jobs)
+    console, clock = Console(), Clock(jobs)
+    draws = console.is_interactive and console.file.isatty()
+
+    def tell(job: Job) -> None:
+        said = line(jobs, job, clock)
+        if not draws:
+            print(said, flush=True)
+        elif job.reason:  # stays above the table
+            console.print(Text(said, style="red"))
+
+    shown = Live(Overview(jobs, finished_before, clock), console=console, refresh_per_second=1) if draws else nullcontext()
     with ThreadPoolExecutor(at_once) as pool:
         try:
-            with Live(table(jobs), console=console, refresh_per_second=1) if console.is_terminal else nullcontext():
+            with shown:
                 for future in in_order(jobs, lambda job: pool.submit(launch_one, job, retries, engine, tell), tell):
                     future.result()
         except KeyboardInterrupt:
@@ -272,38 +178,62 @@ def in_order(
             yield from ended
 
 
-def main() -> None:
-    """Command line."""
+def _at_least(least: int) -> Callable[[str], int]:
+    def whole_number(text: str) -> int:
+        if not text.isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"must be a whole number from {least} on, got {text!r}")
+        return int(text)
+
+    return whole_number
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suite", type=Path)
     parser.add_argument("--engine", choices=["local", "ray"], default="local")
     parser.add_argument("--address", default="auto", help="of the Ray cluster")
-    parser.add_argument("--jobs", type=int, help="runs side by side; default: one on each CPU")
-    parser.add_argument("--retries", type=int, default=1, help="further attempts after a run that failed")
-    parser.add_argument("--runs", type=Path, default=RUNS)
+    parser.add_argument("--jobs", type=_at_least(1), help="runs side by side; default: one on each CPU")
+    parser.add_argument("--retries", type=_at_least(0), default=1, help="further attempts after a run that failed; default: 1")
+    parser.add_argument("--runs", type=Path, default=RUNS, help="directory of all runs")
     add_reuse_options(parser)
-    parser.add_argument("--dry-run", action="store_true", help="print the commands of what is left to do")
-    options = parser.parse_args()
+    parser.add_argument(
+        "--dry-run", action="store_true", help="print the commands of what is left to do, and how many there are"
+    )
+    return parser
+
+
+def main() -> None:
+    """Command line."""
+    options = _parser().parse_args()
     try:
         jobs, finished = jobs_left(options.suite.resolve(), options.runs.resolve(), options.reuse_results, options.rerun)
         if not options.dry_run:
             check_programs(job.spec for job in jobs)
-    except ValueError as error:
+            check_simulators(job.spec for job in jobs)
+    except (ValueError, OSError) as error:
         sys.exit(str(error))
+    left = f"{len(jobs)} left to run, {sum(job.spec.steps for job in jobs):,} environment steps"
     if options.dry_run:
-        print("\n".join(shlex.join(job.command) for job in jobs))
+        print("\n".join([*(shlex.join(job.command) for job in jobs), f"# {finished} finished, {left}."]))
         return
     engine = LocalEngine() if options.engine == "local" else RayEngine(options.address)
-    launch(jobs, options.jobs or engine.cpus, options.retries, engine)
+    at_once = options.jobs or engine.cpus
+    print(f"{options.suite.name}: {finished} finished before, {left}, {at_once} at once.", flush=True)
+    launch(jobs, at_once, options.retries, engine, finished)
+    sys.exit(_tell_end(jobs, finished))
+
+
+def _tell_end(jobs: Sequence[Job], finished: int) -> bool:
+    """Print how a launch ended; whether badly."""
     failed, not_started = ([job for job in jobs if job.state == state] for state in ("failed", "not started"))
     for job in failed:
-        print(f"{job.directory}: FAILED, see {job.log}")
+        print(f"{job.directory}: FAILED, see {job.log}: {job.reason}")
     for job in not_started:
-        print(f"{job.directory}: NOT STARTED{_reason(job)}")
+        print(f"{job.directory}: NOT STARTED{why_not_started(job)}")
     now = len(jobs) - len(failed) - len(not_started)
     more = f", {len(not_started)} not started" if not_started else ""
     print(f"{finished} were finished before, {now} now, {len(failed)} failed{more}.")
-    sys.exit(bool(failed or not_started))
+    return bool(failed or not_started)
 
 
 if __name__ == "__main__":

@@ -144,7 +144,10 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
     :return: its runs, by entry of its ``cells`` and noise
     :raises ValueError: if a key is unknown or missing, or a run is listed twice
     """
-    suite = yaml.safe_load(path.read_text())
+    try:
+        suite = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path.name} is not YAML: {error}") from None
     check_is(path.name, suite, "a mapping", Mapping)
     if "preset" in suite:
         suite = {**read_preset(suite["preset"]).run, **suite}
@@ -344,7 +347,7 @@ def check_numbers(where: str, value: Any, is_meant: Callable[[Any], Any] | None 
     :raises ValueError: naming a number that YAML reads as text
     """
     if (is_meant or is_number_as_text)(value):
-        raise ValueError(f"{where}: YAML reads {value!r} as text: a number has a decimal point before its e, as in 1.0e-3.")
+        raise ValueError(f"{where}: YAML reads {value!r} as text: write a number out, or as 1.0e-3 and 1.0e+5.")
     pairs = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
     for key, inner in pairs:
         check_numbers(f"{where}, {key}", inner, is_meant)
@@ -362,7 +365,7 @@ def check_is(
     :raises ValueError: if it is something else
     """
     if isinstance(value, bool) or not isinstance(value, kinds) or not holds(value):
-        hint = f" YAML reads {value!r} as text: a number has a decimal point before its e." if is_number_as_text(value) else ""
+        hint = f" YAML reads {value!r} as text: write a number out, or as 1.0e-3." if is_number_as_text(value) else ""
         raise ValueError(f"{where}: must be {what}, got {value!r}.{hint}")
 
 

@@ -71,6 +71,8 @@ _WHERE = {
 }
 
 
+#: Module -> extra that has it, of those that torch looks for when it is imported, and may trip over
+_EXTRAS = {"onnx": "export", "onnxruntime": "export"}
 _RENAMED = {"Learner": "OnnxPolicy"}
 
 
@@ -80,7 +82,15 @@ def __getattr__(name: str) -> Any:
         name = _RENAMED[name]
     if name not in _WHERE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_WHERE[name]), name)
+    try:
+        return getattr(import_module(_WHERE[name]), name)
+    except ModuleNotFoundError as error:
+        missing = next((module for module in _EXTRAS if str(error) == f"No module named {module!r}"), None)
+        if missing is None:
+            raise
+        from sb3_gac.envs.suites.extras import missing_extra
+
+        raise missing_extra(f"sb3_gac.{name}", missing, _EXTRAS[missing]) from error
 
 
 def __dir__() -> list[str]:

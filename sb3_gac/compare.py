@@ -13,6 +13,8 @@ and which algorithm to train with.
 import sys
 from pathlib import Path
 
+from sb3_gac.envs.suites.extras import missing_extra
+
 CHECKOUT = Path(__file__).resolve().parents[1]
 
 
@@ -23,10 +25,7 @@ def main() -> None:
     try:
         from benchmarks.comparison import main as compare
     except ImportError as error:
-        sys.exit(
-            f"sb3_gac.compare needs the benchmarks' runner, and there is no {error.name}: in a clone of sb3_gac, "
-            'pip install -e ".[benchmarks]".'
-        )
+        sys.exit(str(missing_extra("sb3_gac.compare", error.name or "the benchmarks' runner", "benchmarks")))
     compare(__doc__)
 
 

@@ -19,10 +19,15 @@ try:
     import onnxruntime
 except ImportError as error:
     raise ImportError(
-        'sb3_gac.learner needs onnxruntime: on the robot pip install onnxruntime, in the clone pip install -e ".[export]".'
+        "sb3_gac.learner needs onnxruntime: pip install onnxruntime on the robot; elsewhere the extra sb3_gac[export] has it: "
+        'pip install -e ".[export]" in the clone of sb3_gac.'
     ) from error
 
 METADATA_KEY = "sb3_gac"
+_READERS = {  # suffix of another kind of file -> what reads it
+    ".pt": 'torch.jit.load("{}") reads TorchScript; for OnnxPolicy, export_learner(model, "<name>.onnx") writes ONNX.',
+    ".zip": 'GAC.load("{}") reads a saved model; export_learner(model, "<name>.onnx") then writes ONNX.',
+}
 
 
 class OnnxPolicy:
@@ -36,6 +41,7 @@ class OnnxPolicy:
         self._session = session
         self.metadata: dict[str, Any] = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
         entries = self.metadata["entries"]
+        self._channels_first = {entry["name"] for entry in entries if entry.get("layout") == "channels first"}
         self._entries = {entry["name"]: (np.dtype(entry["dtype"]), tuple(entry["shape"])) for entry in entries}
         self._counted = {entry["name"]: (entry["smallest"], entry["largest"]) for entry in entries if "largest" in entry}
         self._memory: dict[str, Any] | None = self.metadata["memory"]
@@ -45,8 +51,16 @@ class OnnxPolicy:
     def load(cls, path: str | Path) -> "OnnxPolicy":
         """
         :param path: of a file that :func:`sb3_gac.deploy.export.export_learner` wrote
-        :raises ValueError: if it is another file
+        :raises FileNotFoundError: if there is none
+        :raises ValueError: if it is another file, such as one for TorchScript, or a saved model
         """
+        path = Path(path)
+        if not path.exists():
+            with_suffix = path.with_name(f"{path.name}.onnx")
+            hint = f" There is {with_suffix}." if with_suffix.exists() else ""
+            raise FileNotFoundError(f"There is no file {path}: sb3_gac.export_learner writes one.{hint}")
+        if path.suffix in _READERS:
+            raise ValueError(f"{path} is no ONNX file: {_READERS[path.suffix].format(path)}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # small networks: waking other threads takes longer than their work
         try:
@@ -63,7 +77,8 @@ class OnnxPolicy:
 
     def act(self, observation: np.ndarray | Mapping[str, np.ndarray]) -> np.ndarray:
         """
-        :param observation: of the policy's entries, single or batched, as the sensors give it; where there is one, that alone
+        :param observation: of the policy's entries, single or batched, as the sensors give it; where there is one, that alone.
+            Images may have their channels last, as cameras give them, or first, as the policy has them
         :return: action in the environment's range
         :raises ValueError: if an entry is missing, not one of the policy's, of another shape or type, not finite, or a choice
             that there is not; if the number of observations changes within an episode
@@ -117,6 +132,8 @@ class OnnxPolicy:
             given, array = array, array.astype(dtype)
             if dtype.kind != "f" and not np.array_equal(given, array):
                 raise ValueError(f'The entry "{name}" holds values that its type {dtype} can\'t hold.')
+        if name in self._channels_first:
+            array = _with_channels_first(array, shape)
         n_leading = array.ndim - len(shape)
         if array.shape[n_leading:] != shape or n_leading not in (0, 1):
             raise ValueError(f'The entry "{name}" must have the shape {shape}, or (B, ...) of it, but has {array.shape}.')
@@ -129,6 +146,18 @@ class OnnxPolicy:
                     f'The entry "{name}" holds values that are not from {smallest} to {largest}: {array.tolist()}.'
                 )
         return array
+
+
+def _with_channels_first(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """
+    What SB3's ``predict`` does to an image.
+
+    :param array: one image or several, channels first or last, or something else
+    :param shape: that an image must have, channels first
+    :return: channels first, if it was channels last; otherwise as it was
+    """
+    is_channels_last = array.shape[-3:] == (*shape[1:], shape[0]) and array.shape[-3:] != shape
+    return np.moveaxis(array, -1, -3) if is_channels_last else array
 
 
 def __getattr__(name: str) -> Any:

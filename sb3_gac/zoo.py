@@ -23,6 +23,7 @@ import yaml
 
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class, name_of
 from sb3_gac.envs.suites import SUITES
+from sb3_gac.envs.suites.extras import missing_extra
 from sb3_gac.presets import merge, read_preset
 
 try:
@@ -31,9 +32,7 @@ try:
     from rl_zoo3.enjoy import enjoy
     from rl_zoo3.train import train
 except ImportError as error:
-    raise ImportError(
-        f'sb3_gac.zoo needs rl_zoo3, and {error.name} is not there: pip install -e ".[zoo]" in the clone.'
-    ) from error
+    raise missing_extra("sb3_gac.zoo", error.name or "rl_zoo3", "zoo") from error
 
 PRESET, N_TIMESTEPS = "small", 100_000
 _NET_ARCHS = {"small": [128, 128], "medium": [256, 256], "large": [400, 300]}

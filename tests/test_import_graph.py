@@ -37,7 +37,7 @@ FORBIDDEN = {
     "sb3_gac/tabular/**/*.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac(?!\.tabular\b)",
     "sb3_gac/schedules.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "sb3_gac/algorithms.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
-    "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.(algorithms|envs\.suites)\b)",
+    "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.(algorithms|envs\.suites|presets)\b)",
     "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
     **{f"benchmarks/{path}.py": rf"torch\b|sb3_gac\b|benchmarks(?!\.({DRAWING})\b)" for path in ("report", "page/**/*")},

@@ -1,7 +1,10 @@
 """Named sets of arguments."""
 
 import re
+import warnings
 
+import gymnasium
+import numpy as np
 import pytest
 import torch as th
 import yaml
@@ -10,7 +13,7 @@ import sb3_gac.presets
 from sb3_gac import GAC, PRESETS, AsymmetricSAC, GACShare, preset
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
 from sb3_gac.checks.arguments import constructor_parameters
-from sb3_gac.envs.suites import SUITES, task_of
+from sb3_gac.envs.suites import SUITES, env_id_of, task_named, task_of
 from sb3_gac.presets import instantiate, read_preset
 from tests.helpers import TwoViewBandit
 
@@ -71,7 +74,9 @@ def test_the_papers_tasks_in_brax_are_the_papers_tasks():
         assert preset("paper", task=task_of(task), noise=0.1) == preset("paper", task=name, noise=0.1)
         assert name in PRESETS["paper"].tasks
     assert preset("paper", task="brax-Ant", noise=0.3)["target_kl"] == 0.001
-    assert preset("paper", task="other-Ant", noise=0.3)["target_kl"] == preset("paper")["target_kl"] == 0.005
+    with pytest.raises(ValueError, match=r"nearest are \[.*'Ant'.*got 'other-Ant'"):
+        preset("paper", task="other-Ant", noise=0.3)
+    assert preset("paper", task="Hopper", noise=0.3)["target_kl"] == preset("paper")["target_kl"] == 0.005
 
 
 def test_target_kl_is_that_of_task_and_noise_or_ones_own():
@@ -82,6 +87,83 @@ def test_target_kl_is_that_of_task_and_noise_or_ones_own():
     assert "target_kl" not in preset("small", task="Hopper", noise=0.3)
     assert "target_kl" not in preset("small")
     assert preset("paper")["target_kl"] == 0.005
+
+
+@pytest.mark.parametrize("name", ["HalfCheetah-v5", "sb3_gac/HalfCheetah-v5", "sb3_gac:sb3_gac/HalfCheetah-v5", "HalfCheetah"])
+def test_a_task_may_be_an_id(name):
+    assert preset("paper", task=name, noise=0.3) == preset("paper", task="HalfCheetah", noise=0.3)
+    assert preset("paper", task=name, noise=0.3)["target_kl"] == 0.001
+    assert task_named(name) == "HalfCheetah"
+    assert env_id_of(name) == "sb3_gac/HalfCheetah-v5"
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("HalfCheeta", "HalfCheetah"),
+        ("halfcheetah", "HalfCheetah"),
+        ("Ant-v4", "Ant"),
+        ("RepeatPreviousEasy", "popgym-RepeatPreviousEasy"),
+    ],
+)
+def test_an_unknown_task_is_an_error_that_names_the_nearest(name, nearest):
+    for named in (lambda: preset("small", task=name), lambda: env_id_of(name)):
+        with pytest.raises(ValueError, match=rf"^task must be one of .*nearest are \[.*'{nearest}'.*got '{name}'"):
+            named()
+
+
+def test_an_environment_that_somebody_else_registers_is_a_task(monkeypatch):
+    monkeypatch.setitem(gymnasium.registry, "sb3_gac/Mine-v3", gymnasium.spec("CartPole-v1"))
+    assert env_id_of("Mine") == env_id_of("Mine-v3") == "sb3_gac/Mine-v3"
+    assert preset("small", task="Mine") == preset("small", task=None)
+
+
+def test_a_noise_is_the_nearest_entry_within_rounding():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for noise in (0.1 + 0.2, np.float32(0.3).item(), 0.3 - 1e-12):
+            assert noise != 0.3
+            assert preset("paper", task="Ant", noise=noise)["target_kl"] == 0.001
+        assert preset("paper", task="Ant", noise=1e-12)["target_kl"] == 0.01
+        for name in ("small", "paper"):
+            for task in PRESETS[name].tasks:
+                for noise in (0, 0.1, 0.2, 0.3):
+                    preset(name, task=task, noise=noise)
+
+
+def test_between_two_noises_numbers_are_interpolated_which_is_said():
+    with pytest.warns(UserWarning, match=r"^The preset small for HalfCheetah has no .* noise 0\.15: .*0\.1 and 0\.2"):
+        found = preset("small", task="HalfCheetah", noise=0.15)
+    assert found["target_kl"] == pytest.approx((0.0033 + 0.001) / 2), "the default of GAC at 0.1, which the file leaves alone"
+    with pytest.warns(UserWarning, match=r"between those at 0 and 0\.1: target_kl 0\.00875"):
+        assert preset("paper", task="brax-Ant", noise=0.025)["target_kl"] == pytest.approx(0.01 - 0.005 / 4)
+    with pytest.warns(UserWarning, match=r"those at 0\.3, the nearest: target_kl 0\.001"):
+        assert preset("paper", task="Ant", noise=0.7)["target_kl"] == 0.001
+
+
+def test_nothing_is_said_where_an_algorithm_has_nothing_by_noise():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert preset("small", algorithm=AsymmetricSAC, task="Ant", noise=0.15) == preset("small", algorithm=AsymmetricSAC)
+        preset("small", task="InvertedDoublePendulum", noise=0.15)
+
+
+def test_what_is_no_number_is_that_of_the_nearer_noise(tmp_path, monkeypatch):
+    monkeypatch.setattr(sb3_gac.presets, "DIRECTORY", tmp_path)
+    noises = {0.1: {"gac": {"guider": "independent", "tau": 0.1}}, 0.2: {"gac_share": {"policy_kwargs": {"n_critics": 3}}}}
+    content = {"run": {"envs": 1}, "arguments": {"gac": {"tau": 0.2}}, "tasks": {"Own": {"noises": noises}}}
+    (tmp_path / "own.yml").write_text(yaml.safe_dump(content))
+    with pytest.warns(UserWarning, match="interpolated"):
+        found = [preset("own", algorithm="gac_share", task="Own", noise=noise) for noise in (0.125, 0.175)]
+    assert [arguments["guider"] for arguments in found] == ["independent", "residual"]
+    assert [arguments["tau"] for arguments in found] == [pytest.approx(0.125), pytest.approx(0.175)]
+    assert [arguments["policy_kwargs"] for arguments in found] == [{}, {"n_critics": 3}]
+
+
+@pytest.mark.parametrize("noise", [-0.1, float("nan"), None, "0.1"])
+def test_a_noise_that_is_none_is_refused(noise):
+    with pytest.raises(ValueError, match="noise must be a number of at least 0, got"):
+        preset("small", task="Ant", noise=noise)
 
 
 def test_what_one_algorithm_has_of_its_own_reaches_it_and_its_subclasses_alone():

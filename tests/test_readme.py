@@ -21,6 +21,7 @@ SMALL = {"learning_starts": 100, "batch_size": 16, "buffer_size": 1_000, "policy
 
 def _shorter(block):
     (warm_up,) = re.findall("learning_starts=([0-9]+)", block)[:1] or ["100"]
+    block = block.replace("noise_std=0.1)", "noise_std=0.1, max_episode_steps=50)")
     shorter = SHORTER | {"100_000": str(int(warm_up) + 20)}
     return re.sub(r"\b[0-9]+_[0-9_]+\b", lambda number: shorter[number.group()], block)
 

@@ -21,6 +21,7 @@ from sb3_gac.checks.entries import computable
 from sb3_gac.checks.values import check_positive, index_bounds
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import check_agreement, draw_observations
+from sb3_gac.envs.suites.extras import missing_extra
 from sb3_gac.networks.actors import DeployedPolicy
 from sb3_gac.networks.recurrent import Memory
 from sb3_gac.version import __version__
@@ -116,7 +117,7 @@ def export_learner(
     for its use.
 
     :param model: trained
-    :param path: with the suffix ".onnx", or ".pt" for TorchScript
+    :param path: with the suffix ".onnx", or ".pt" for TorchScript; folders that are not there are made
     :param normalizer: of the observations; by default that of the model's ``VecNormalize``, if it has one
     :param units: entry, or "action" -> unit, kept in the file's metadata
     :param verify_on: number of observations to compare the file's actions and those of ``predict`` on, see
@@ -134,6 +135,7 @@ def export_learner(
     normalizer = _normalizer_of(model) if normalizer is None else normalizer
     module = DeployedModule(deepcopy(model.policy.deployed), normalizer).cpu().eval().requires_grad_(False)
     metadata = json.dumps(describe(module, type(model).__name__, units or {}), allow_nan=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with th.no_grad(), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as directory:
         written = Path(directory) / path.name
         WRITERS[path.suffix](module, written, metadata)
@@ -233,9 +235,7 @@ def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
         import onnx
         import onnxruntime  # noqa: F401, with which the file is compared
     except ImportError as error:
-        raise ImportError(
-            f'A file for ONNX needs onnx and onnxruntime ({error}): pip install -e ".[export]" in the clone.'
-        ) from error
+        raise missing_extra("A file for ONNX", error.name or "onnx and onnxruntime", "export") from error
 
     remembers = module.memory is not None
     inputs = [*module.keys, *[module.state_name] * remembers]

@@ -24,7 +24,8 @@ import yaml
 from torch import nn, optim
 
 from sb3_gac.algorithms import ALGORITHMS, FAMILIES, algorithm_class, name_of
-from sb3_gac.envs.suites import shows_whole_state
+from sb3_gac.envs.suites import shows_whole_state, task_named
+from sb3_gac.presets.noises import at_noise, defaults_of, merge
 
 DIRECTORY = Path(__file__).parent
 _ALIASES = {"paper": "paper-brax"}
@@ -56,16 +57,25 @@ class Preset:
     def layers(self, algorithm: type, task: str | None, noise: float) -> Iterator[Mapping[str, Any]]:
         """
         :param algorithm: class that the arguments are for
-        :param task: as in ``sb3_gac/<task>-v5``, if it is one that has a name; Brax's ``brax-<task>`` are those of the paper
-        :param noise: of that task
+        :param task: of an environment that is registered as ``sb3_gac/<task>-v5``, by its name or that id; ``None`` for any
+            other environment. Brax's ``brax-<task>`` are those of the paper
+        :param noise: standard deviation of the task's sensor noise; between two for which the file has arguments, numbers are
+            interpolated, and beyond the last one it is that one's that count, both with a warning
         :return: arguments, the later over the earlier: in each part of the file those of all, of ancestors, and its own.
             ``role_keys`` that leave critics the privileged entry alone are not for tasks where that is not the whole state
+        :raises ValueError: if there is no such task, naming the nearest ones, or the noise is negative
         """
         families = ["all", *map(name_of, reversed(algorithm.__mro__))]
+        if task is not None and task not in self.tasks:
+            task = task_named(task)
         of_task = self.tasks.get(task or "", self.tasks.get((task or "").removeprefix(_BRAX), {}))
-        noises = {float(level): sections for level, sections in of_task.get("noises", {}).items()}
-        parts = (self.arguments, of_task.get("arguments", {}), noises.get(noise, {}))
+        parts = (self.arguments, of_task.get("arguments", {}))
         found = [sections[family] for sections in parts for family in families if family in sections]
+        by_noise = {
+            float(level): [sections[family] for family in families if family in sections]
+            for level, sections in of_task.get("noises", {}).items()
+        }
+        found += at_noise(f"The preset {self.name} for {task}", by_noise, noise, [defaults_of(algorithm), *found])
         yield from found
         if any("role_keys" in layer for layer in found) and task is not None and not shows_whole_state(task):
             yield {"role_keys": None}
@@ -134,12 +144,13 @@ def preset(
     """
     :param name: one of ``PRESETS``, such as "small" or "paper"
     :param algorithm: that the arguments are for: its class, or its name in :mod:`sb3_gac.algorithms`
-    :param task: as in ``sb3_gac/<task>-v5`` or ``sb3_gac/brax-<task>-v0``: with what the preset has for it, if anything
-    :param noise: of that task
+    :param task: as in ``sb3_gac/<task>-v5`` or ``sb3_gac/brax-<task>-v0``, or that id: with what the preset has for it, if
+        anything; ``None`` for an environment that is not registered so
+    :param noise: standard deviation of that task's sensor noise; see :meth:`Preset.layers` for one between the file's
     :param overrides: arguments that replace those of the preset; ``policy_kwargs`` are merged
     :return: keyword arguments of the algorithm, with its ``policy`` where the preset names one; ``PRESETS[name].envs``
         environments go with them
-    :raises ValueError: if there is no such preset or algorithm
+    :raises ValueError: if there is no such preset, algorithm or task, or the noise is negative
     """
     found = read_preset(name)
     kind = algorithm if isinstance(algorithm, type) else _class_of(algorithm)
@@ -154,18 +165,6 @@ def _class_of(algorithm: str) -> type:
         return algorithm_class(algorithm)
     except ValueError as error:
         raise ValueError(f"algorithm {error}") from None
-
-
-def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    :param below: arguments
-    :param above: what replaces them, key by key; ``policy_kwargs`` are merged
-    """
-    merged = dict(below)
-    for key, value in above.items():
-        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
-        merged[key] = merge(merged[key], value) if both and key == "policy_kwargs" else value
-    return merged
 
 
 def instantiate(arguments: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,6 @@
-"""What is seen of a launch while it goes on: in a terminal of any height, and in a log."""
+"""How runs are launched: every attempt, start, end and failure is told, and whatever goes wrong is one run's failure."""
 
 import io
-import json
 import os
 import signal
 import subprocess
@@ -14,105 +13,194 @@ import yaml
 from rich.console import Console
 
 from benchmarks import launch
-from benchmarks.launch import Job, count, launch_one, print_line, progress, table
+from benchmarks.config import check_simulators
+from benchmarks.engines import run_process
+from benchmarks.jobs import Clock, count, reason_in
+from benchmarks.launch import launch_one
+from benchmarks.overview import line
 from benchmarks.suite import RunSpec
+from sb3_gac.envs.suites import SUITES
+from tests.benchmarks.helpers import evaluated, jobs_in
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "benchmarks" / "suites" / "smoke.yml"
-
-
-def _jobs(directory, *states):
-    """With seeds from 0 on, one in each state."""
-    specs = [RunSpec("gac", "Ant", 0.1, seed, 1000, 4, "small", 500, 1) for seed in range(len(states))]
-    return [Job(spec, spec.directory(directory), [], state) for spec, state in zip(specs, states, strict=True)]
-
-
-def _drawn(jobs, height, width=100):
-    out = io.StringIO()
-    Console(file=out, force_terminal=True, width=width, height=height, color_system=None).print(table(jobs))
-    return out.getvalue().splitlines()
-
-
-@pytest.mark.parametrize("height", [12, 24, 40])
-@pytest.mark.parametrize("width", [72, 100])
-def test_whatever_the_terminal_has_room_for_running_and_failed_runs_come_first(tmp_path, height, width):
-    jobs = _jobs(tmp_path, "failed", *["running"] * 2, *["finished"] * 80, "running", *["waiting"] * 200)
-    lines = _drawn(jobs, height, width)
-    assert len(lines) < height, "one line is the terminal's own"
-    runs = [line.strip("│ ").split("│") for line in lines[3:-2]]
-    assert len(runs) == height - 6
-    states = [run[4].strip() for run in runs]
-    assert states == ["finished"] * (height - 10) + ["failed"] + ["running"] * 3
-    seeds = [int(run[3]) for run in runs]
-    assert seeds == [*range(83 - (height - 10), 83), 0, 1, 2, 83], "of those that finished, the last"
-    hidden = 84 - (height - 6)
-    assert lines[-1].startswith(f"1 failed, 80 finished, 3 running, 200 waiting; {hidden} of them not shown"[:width])
-
-
-def test_where_there_is_room_everything_is_shown_but_what_waits(tmp_path):
-    lines = _drawn(_jobs(tmp_path, "finished", "running", "waiting"), 24)
-    assert len(lines) == 7
-    assert lines[-1] == "1 finished, 1 running, 1 waiting"
-
-
-def test_more_running_runs_than_rows_show_the_last(tmp_path):
-    lines = _drawn(_jobs(tmp_path, *["running"] * 30, "finished"), 16)
-    assert [line.split("│")[4].strip() for line in lines[3:-2]] == [str(seed) for seed in range(20, 30)]
-
-
-def test_progress_is_that_of_the_last_evaluation(tmp_path):
-    waiting, running, finished = _jobs(tmp_path, "waiting", "running", "finished")
-    assert [progress(job) for job in (waiting, running, finished)] == [("", ""), ("0 / 1000", ""), ("", "")]
-    for job in (running, finished):
-        job.directory.mkdir(parents=True)
-        (job.directory / "timing.json").write_text(json.dumps({"steps": 500, "learner": 12.34, "seconds": 1}))
-        assert progress(job) == ("500 / 1000", "12.3")
-    (running.directory / "timing.json").write_text("{")
-    assert progress(running) == ("0 / 1000", "")
+NAME = "small-1000/Ant-noise0.1/gac/seed0"
 
 
 class _Engine:
     """
-    :param statuses: of its processes, one after the other
+    :param ends: of its processes, one after the other: a status, or an error that the engine raises; each leaves a traceback
     """
 
-    def __init__(self, *statuses):
-        self._statuses = iter(statuses)
+    def __init__(self, *ends):
+        self._ends = iter(ends)
 
     def run(self, command, log):
-        return next(self._statuses)
+        end = next(self._ends)
+        if isinstance(end, Exception):
+            raise end
+        with log.open("a") as file:
+            file.write("--- attempt: python -m something\n" + (TRACEBACK if end else "all is well\n"))
+        return end
+
+
+TRACEBACK = """Traceback (most recent call last):
+  File "first.py", line 1, in <module>
+KeyError: 'of another'
+
+During handling of the above exception, another exception occurred:
+
+Traceback (most recent call last):
+  File "second.py", line 7, in f
+    raise ValueError("bad joint")
+ValueError: bad joint: mend it
+    and look again
+"""
 
 
 @pytest.mark.parametrize(
-    ("statuses", "retries", "state"),
-    [([0], 1, "finished"), ([1, 0], 1, "finished"), ([1, 1], 1, "failed"), ([1], 0, "failed")],
+    ("ends", "retries", "state"),
+    [
+        ([0], 1, "finished"),
+        ([1, 0], 1, "finished"),
+        ([1, 1], 1, "failed"),
+        ([1], 0, "failed"),
+        ([OSError("no node"), 1], 1, "failed"),
+        ([OSError("no node"), 0], 1, "finished"),
+    ],
 )
-def test_every_change_of_state_is_a_line_in_a_log(tmp_path, capsys, statuses, retries, state):
-    jobs = _jobs(tmp_path, "waiting", "waiting")
-    launch_one(jobs[0], retries, _Engine(*statuses), lambda job: print_line(jobs, job))
-    name = "small-1000/Ant-noise0.1/gac/seed0"
-    ended = "1 finished, 0 running, 1 waiting" if state == "finished" else "1 failed, 0 finished, 0 running, 1 waiting"
-    assert capsys.readouterr().out.splitlines() == [
-        f"{name}: running (0 finished, 1 running, 1 waiting)",
-        f"{name}: {state} ({ended})",
-    ]
-    (jobs[0].directory / "timing.json").write_text(json.dumps({"steps": 1000, "learner": 7}))
-    print_line(jobs, jobs[0])
-    assert f"{name}: {state}, 1000 / 1000 steps, return 7.0 (" in capsys.readouterr().out
+def test_every_change_of_state_and_every_failure_is_a_line_in_a_log(tmp_path, ends, retries, state):
+    jobs, lines = jobs_in(tmp_path, "waiting", "waiting"), []
+    clock = Clock(jobs, lambda: 0.0)
+    launch_one(jobs[0], retries, _Engine(*ends), lambda job: lines.append(line(jobs, job, clock)))
+    said = ["OSError: no node" if isinstance(end, OSError) else "ValueError: bad joint: mend it" for end in ends]
+    running, ended = (f"{NAME}: running (0 finished, 1 running, 1 waiting)", f"{NAME}: {state}")
+    again = [f"{NAME}: tried again: {reason} (0 finished, 1 running, 1 waiting)" for reason in said[: len(ends) - 1]]
+    counts = "(1 finished, 0 running, 1 waiting)" if state == "finished" else "(1 failed, 0 finished, 0 running, 1 waiting)"
+    assert lines == [running, *again, f"{ended}: {said[-1]} {counts}" if state == "failed" else f"{ended} {counts}"]
+    evaluated(jobs[0], 1000, 7)
+    assert line(jobs, jobs[0], clock).startswith(f"{NAME}: {state}, 1,000 / 1,000 steps, return 7.0")
+
+
+def test_an_engine_that_raises_fails_its_run_and_no_other(tmp_path, capsys):
+    """Nor does a run whose directory can't be made."""
+    jobs = jobs_in(tmp_path, "waiting", "waiting", "waiting")
+    jobs[2].directory.parent.mkdir(parents=True)
+    jobs[2].directory.touch()
+    launch.launch(jobs, 1, 0, _Engine(RuntimeError("the cluster is gone"), 0))
+    assert [job.state for job in jobs] == ["failed", "finished", "failed"]
+    assert f"{NAME}: failed: RuntimeError: the cluster is gone (1 failed" in capsys.readouterr().out
+    assert jobs[2].reason.startswith("FileExistsError: ")
+
+
+def _log(tmp_path, code):
+    """Status and log of a real process, after another attempt."""
+    log = tmp_path / "log.txt"
+    log.write_text(f"--- attempt: earlier\n{TRACEBACK}")
+    return log, run_process([sys.executable, "-c", code], log)
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        ("print(1); raise ValueError('bad joint\\nof the arm')", "ValueError: bad joint"),
+        ("def f():\n try:\n  1/0\n except ZeroDivisionError:\n  raise KeyError('knee')\nf()", "KeyError: 'knee'"),
+        ("raise ValueError", "ValueError"),
+        ("import sys; sys.exit('the task is unknown')", "the task is unknown (exit status 1)"),
+        ("import os; os._exit(3)", "exit status 3, and no output"),
+        ("import os, signal; print(1, flush=True); os.kill(os.getpid(), signal.SIGKILL)", "killed by SIGKILL, as when"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "killed by SIGSEGV"),
+        ("print('x' * 200_000); raise ValueError('at last')", "ValueError: at last"),
+    ],
+)
+def test_the_reason_is_that_of_the_last_attempt(tmp_path, code, reason):
+    found = reason_in(*_log(tmp_path, code))
+    assert found.startswith(reason)
+    assert reason.endswith("as when") or found == reason
+
+
+def test_the_reason_of_a_run_without_a_log_is_its_status(tmp_path):
+    assert reason_in(tmp_path / "log.txt", 9) == "exit status 9, and no output"
+
+
+def test_what_failed_is_named_at_the_end_with_its_reason(tmp_path, monkeypatch, capsys):
+    engine = _Engine(1, 0, 0, 0)
+    engine.cpus = 1
+    monkeypatch.setattr(launch, "LocalEngine", lambda: engine)
+    monkeypatch.setattr(sys, "argv", ["launch", str(SMOKE), "--runs", str(tmp_path), "--retries", "0"])
+    with pytest.raises(SystemExit) as end:
+        launch.main()
+    first, *_, last = said = capsys.readouterr().out.splitlines()
+    assert end.value.code == 1
+    assert first == "smoke.yml: 0 finished before, 4 left to run, 2,400 environment steps, 1 at once."
+    directory = tmp_path / "small-600/InvertedDoublePendulum-noise0.1/gac/seed0"
+    assert said[-2] == f"{directory}: FAILED, see {directory / 'log.txt'}: ValueError: bad joint: mend it"
+    assert last == "0 were finished before, 3 now, 1 failed."
 
 
 def test_states_that_there_are_are_counted(tmp_path):
-    assert count(_jobs(tmp_path, "waiting", "running", "running")) == "0 finished, 2 running, 1 waiting"
-    assert count(_jobs(tmp_path, "failed")) == "1 failed, 0 finished, 0 running, 0 waiting"
+    assert count(jobs_in(tmp_path, "waiting", "running", "running")) == "0 finished, 2 running, 1 waiting"
+    assert count(jobs_in(tmp_path, "failed")) == "1 failed, 0 finished, 0 running, 0 waiting"
 
 
-def test_a_terminal_has_a_table_and_no_lines(tmp_path, monkeypatch):
-    out = io.StringIO()
+class _Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_has_a_table_and_lines_of_failures_alone(tmp_path, monkeypatch):
+    out = _Terminal()
     console = Console(file=out, force_terminal=True, width=100, height=24)
     monkeypatch.setattr(launch, "Console", lambda: console)
-    launch.launch(_jobs(tmp_path, "waiting", "waiting"), 1, 0, _Engine(0, 0))
-    assert "2 finished, 0 running, 0 waiting" in out.getvalue()
+    launch.launch(jobs_in(tmp_path, "waiting", "waiting"), 1, 1, _Engine(1, 0, 0), finished_before=3)
+    assert "2 finished, 0 running, 0 waiting, 3 finished before" in out.getvalue()
+    assert "seed0: tried again: ValueError: bad joint" in out.getvalue()
     assert "seed0: running" not in out.getvalue()
+
+
+def test_what_only_claims_to_be_a_terminal_has_lines(tmp_path, monkeypatch, capsys):
+    """As where FORCE_COLOR is set and output goes to a file."""
+    out = io.StringIO()
+    monkeypatch.setattr(launch, "Console", lambda: Console(file=out, force_terminal=True))
+    launch.launch(jobs_in(tmp_path, "waiting"), 1, 0, _Engine(0))
+    assert out.getvalue() == ""
+    assert f"{NAME}: finished (1 finished" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [["--jobs", "0"], ["--jobs", "two"], ["--retries", "-1"]])
+def test_numbers_that_launch_nothing_are_refused(options, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["launch", str(SMOKE), "--runs", str(tmp_path), *options])
+    with pytest.raises(SystemExit) as end:
+        launch.main()
+    assert end.value.code == 2
+    assert f"argument {options[0]}: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", [None, "cells: [", "steps: {"])
+def test_a_suite_that_is_no_yaml_file_is_one_message(text, tmp_path, monkeypatch):
+    path = tmp_path / "broken.yml"
+    if text is not None:
+        path.write_text(text)
+    monkeypatch.setattr(sys, "argv", ["launch", str(path), "--runs", str(tmp_path), "--dry-run"])
+    with pytest.raises(SystemExit, match=r"broken\.yml"):
+        launch.main()
+
+
+def test_a_dry_run_counts(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["launch", str(SMOKE), "--runs", str(tmp_path), "--dry-run"])
+    launch.main()
+    *commands, last = capsys.readouterr().out.splitlines()
+    assert [" -m benchmarks.run --suite " in command for command in commands] == [True] * 4
+    assert last == "# 0 finished, 4 left to run, 2,400 environment steps.", "a comment, for a shell that is given all of it"
+
+
+def test_a_simulator_that_is_missing_is_told_before_the_first_run(monkeypatch):
+    spec = RunSpec("gac", "popgym-RepeatPreviousEasy", 0.0, 0, 1000, 4, "small", 500, 1)
+    gone = {"popgym": SUITES["popgym"]._replace(simulator="no_such_module")}
+    monkeypatch.setattr("benchmarks.config.SUITES", {**SUITES, **gone})
+    with pytest.raises(ValueError, match=r"popgym-RepeatPreviousEasy needs no_such_module, .*sb3_gac\[popgym\]"):
+        check_simulators([spec])
+    check_simulators([RunSpec("gac", "Ant", 0.0, 0, 1000, 4, "small", 500, 1)])
 
 
 def test_a_piped_launch_tells_at_once_and_ends_with_its_runs_on_ctrl_c(tmp_path):
@@ -122,6 +210,7 @@ def test_a_piped_launch_tells_at_once_and_ends_with_its_runs_on_ctrl_c(tmp_path)
     command = [sys.executable, "-m", "benchmarks.launch", tmp_path / "long.yml", "--jobs", "1", "--runs", tmp_path / "runs"]
     restored = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, **restored) as process:
+        assert "4 left to run" in process.stdout.readline()
         first = process.stdout.readline()
         assert first == (
             "small-1000000/InvertedDoublePendulum-noise0.1/gac/seed0: running (0 finished, 1 running, 3 waiting)\n"
@@ -147,7 +236,7 @@ def test_the_command_line_counts(arguments, at_once, retries, state, tmp_path, m
     launched = []
 
     def launches(jobs, *options):
-        launched.append((len(jobs), *options))
+        launched.append((len(jobs), *options[:-1]))
         for job in jobs:
             job.state = "finished"
         jobs[0].state = state

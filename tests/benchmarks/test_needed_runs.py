@@ -16,7 +16,8 @@ import benchmarks.report
 import benchmarks.run
 from benchmarks.aggregate import finished_runs
 from benchmarks.finished import name_of
-from benchmarks.launch import Job, count, jobs_left, launch, run_command
+from benchmarks.jobs import Job, count
+from benchmarks.launch import jobs_left, launch, run_command
 from benchmarks.run import run
 from benchmarks.suite import RunSpec, needed_runs, needed_steps, read_suite
 from sb3_gac import AsymmetricSAC

@@ -301,6 +301,10 @@ def test_unknown_and_missing_keys_are_refused(tmp_path, change, message):
         ({"overrides": {"lerning_rate": 1}}, r"gac: GAC has no arguments \['lerning_rate'\]; it has .*'learning_rate'"),
         ({"overrides": {"learning_rate": "1e-3"}}, "gac, learning_rate: YAML reads '1e-3' as text.*1.0e-3"),
         ({"overrides": {"policy": "MlpPolicy"}}, "gac: policy must be one of .*'MultiInputPolicy'.*got 'MlpPolicy'"),
+        ({"overrides": {"batch_size": 0}}, "Hopper-noise0.1, gac: batch_size must be .*got 0"),
+        ({"overrides": {"buffer_size": -1}}, "gac: buffer_size must be .*got -1"),
+        ({"overrides": {"learning_rate": "fast"}}, "gac: learning_rate must be .*'fast' is no schedule"),
+        ({"cells": [CELL | {"task": "Hopper-v5"}]}, "task must be the name 'Hopper', got 'Hopper-v5'"),
         (
             {"overrides": {"policy_kwargs": {"net_archs": [8]}}},
             r"policy_kwargs: GACPolicy has no arguments .*it has .*'net_arch'",

@@ -355,6 +355,48 @@ def test_bad_files(tmp_path):
         OnnxPolicy.load(tmp_path / "other.onnx")
 
 
+def test_a_folder_that_is_not_there_is_made(tmp_path):
+    path = tmp_path / "robots" / "first" / "learner.onnx"
+    model = small_model(TwoViewBandit())
+    with pytest.raises(ValueError, match="units names"):
+        export_learner(model, path, units={"torque": "N m"})
+    assert not path.parent.parent.exists(), "where nothing is written, nothing is made"
+    assert OnnxPolicy.load(export_learner(model, path)).act(np.zeros(2)).shape == (1,)
+
+
+def test_a_file_that_is_not_there_or_of_another_kind_is_told_with_what_to_do(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no file .*learner\.onnx: sb3_gac\.export_learner writes one\.$"):
+        OnnxPolicy.load(tmp_path / "learner.onnx")
+    model = small_model(TwoViewBandit())
+    export_learner(model, tmp_path / "learner.onnx")
+    with pytest.raises(FileNotFoundError, match=r"There is .*learner\.onnx\.$"):
+        OnnxPolicy.load(str(tmp_path / "learner"))
+    scripted = export_learner(model, tmp_path / "learner.pt")
+    with pytest.raises(ValueError, match=r"learner\.pt is no ONNX file: torch\.jit\.load\(.*learner\.pt.\) reads TorchScript"):
+        OnnxPolicy.load(scripted)
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=r"model\.zip is no ONNX file: GAC\.load"):
+        OnnxPolicy.load(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match="is not an ONNX file"):
+        OnnxPolicy.load(tmp_path)
+
+
+@pytest.mark.parametrize("shape", [(36, 40, 3), (36, 36, 1)])
+def test_images_are_taken_as_cameras_and_predict_have_them(shape, tmp_path):
+    """Channels last, single or batched, and channels first as the policy has them."""
+    camera = spaces.Dict(partial=spaces.Box(0, 255, shape, np.uint8), privileged=VECTOR)
+    model = small_model(Sampled(camera), policy_kwargs=CNN).learn(30)
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx"))
+    images = np.stack([camera["partial"].sample() for _ in range(4)])
+    expected, _ = model.predict({"partial": images}, deterministic=True)
+    assert np.ptp(expected) > 0, "they are told apart"
+    np.testing.assert_allclose(learner.act(images), expected, atol=1e-5)
+    np.testing.assert_allclose(learner.act({"partial": images[2]}), expected[2], atol=1e-5)
+    np.testing.assert_allclose(learner.act(images.transpose(0, 3, 1, 2)), expected, atol=1e-5)
+    with pytest.raises(ValueError, match='"partial" must have the shape'):
+        learner.act(images.transpose(0, 2, 1, 3)[:, :-1])
+
+
 def test_public_names_are_found_and_listed():
     assert set(sb3_gac.__all__) <= set(dir(sb3_gac))
     assert all(getattr(sb3_gac, name) is not None for name in sb3_gac.__all__)

@@ -17,11 +17,14 @@ arguments there may be
 """
 
 from collections.abc import Callable, Mapping
+from difflib import SequenceMatcher
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+
+from sb3_gac.envs.suites.extras import missing_extra
 
 
 class Suite(NamedTuple):
@@ -58,6 +61,15 @@ class Suite(NamedTuple):
         module = self.simulator or self.extra
         return module is None or find_spec(module) is not None
 
+    def how_to_install(self, user: str) -> str:
+        """
+        :param user: what can't be made without the simulator, such as a task
+        :return: a sentence that says what is missing
+        """
+        if self.extra is None:
+            return f"{user} needs {self.simulator}, which no package index has: docs/environments.md says how to install it."
+        return str(missing_extra(user, self.simulator or self.extra, self.extra))
+
     def shows_whole_state(self, env_id: str) -> bool:
         """
         :param env_id: of one of its environments
@@ -66,6 +78,7 @@ class Suite(NamedTuple):
         return bool(self.environments[env_id].get("whole_state", self.sensor_noise))
 
 
+_NAMESPACE = "sb3_gac/"
 #: Arguments of an environment that are this package's, not gymnasium's
 _OWN = ("vec_entry_point", "shapes", "whole_state")
 _SINGLE = "sb3_gac.envs.vector.single:make_single"
@@ -108,14 +121,44 @@ def suite_of(env_id: str) -> str | None:
 
 def env_id_of(task: str) -> str:
     """
-    :param task: see :func:`task_of`
-    :return: the environment that it is the task of
-    :raises ValueError: if there is none
+    :param task: a task's name, or an id, see :func:`task_named`
+    :return: the id of the task's environment
+    :raises ValueError: naming the nearest tasks, if there is none
     """
-    ids = {task_of(env_id): env_id for suite in SUITES.values() for env_id in suite.environments}
-    if task not in ids:
-        raise ValueError(f"task must be one of {sorted(ids)}, got {task!r}.")
-    return ids[task]
+    return registered_tasks()[task_named(task)]
+
+
+def registered_tasks() -> dict[str, str]:
+    """
+    :return: task -> id of its environment, of this package's suites and of whatever else is registered as ``sb3_gac/...``
+    """
+    of_suites = [env_id for suite in SUITES.values() for env_id in suite.environments]
+    others = [env_id for env_id in gym.registry if env_id.startswith(_NAMESPACE)]
+    return {task_of(env_id): env_id for env_id in (*others, *of_suites)}
+
+
+def task_named(name: str) -> str:
+    """
+    :param name: a task's name, or the id of its environment: ``HalfCheetah``, ``HalfCheetah-v5``,
+        ``sb3_gac/HalfCheetah-v5``, or, after a module that registers it, ``sb3_gac:sb3_gac/HalfCheetah-v5``
+    :return: the task's name, ``HalfCheetah``
+    :raises ValueError: naming the nearest tasks, if there is none
+    """
+    ids = registered_tasks()
+    plain = name.rpartition(":")[2].removeprefix(_NAMESPACE)
+    named = {**{env_id.removeprefix(_NAMESPACE): task for task, env_id in ids.items()}, **{task: task for task in ids}}
+    if plain not in named:
+        nearest = sorted(ids, key=lambda task: _likeness(task.casefold(), plain.casefold()), reverse=True)[:3]
+        raise ValueError(
+            f"task must be one of the registered sb3_gac/<task>-v<version>, which python -m sb3_gac.envs lists; the nearest "
+            f"are {nearest}, got {name!r}."
+        )
+    return named[plain]
+
+
+def _likeness(one: str, other: str) -> tuple[bool, float]:
+    """More for names that are alike, most for those of which one holds the other."""
+    return one in other or other in one, SequenceMatcher(None, one, other).ratio()
 
 
 def is_batched(env_id: str) -> bool:
@@ -145,7 +188,7 @@ def task_of(env_id: str) -> str:
     :param env_id: ``sb3_gac/<task>-v<version>``
     :return: the task, as presets and benchmarks name it
     """
-    return env_id.removeprefix("sb3_gac/").rpartition("-v")[0]
+    return env_id.removeprefix(_NAMESPACE).rpartition("-v")[0]
 
 
 def shows_whole_state(task: str) -> bool:
@@ -153,8 +196,5 @@ def shows_whole_state(task: str) -> bool:
     :param task: see :func:`task_of`
     :return: whether its privileged entry has all that ``partial`` shows; of a task that is none of this package's, ``True``
     """
-    try:
-        env_id = env_id_of(task)
-    except ValueError:
-        return True
-    return SUITES[suite_of(env_id) or ""].shows_whole_state(env_id)
+    suite = suite_of(env_id := registered_tasks().get(task, ""))
+    return suite is None or SUITES[suite].shows_whole_state(env_id)

@@ -1,0 +1,158 @@
+"""The runs of a launch: the state of each, how far it has come, why it failed, and how long the rest will take."""
+
+import json
+import signal
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks.checkpoint import TIMING
+from benchmarks.engines import ATTEMPT
+from benchmarks.suite import RunSpec
+
+STATES = ("waiting", "running", "finished", "not started", "failed")
+ENDED_BADLY = ("not started", "failed")
+_READ_AT_MOST = 1 << 16  # bytes from the end of a log, which may be long
+
+
+@dataclass
+class Job:
+    """
+    A run that is left to do.
+
+    :param spec: the run's settings
+    :param directory: where the run's files go
+    :param command: starts the run
+    :param state: one of ``STATES``
+    :param needs: jobs that must be finished before
+    :param reason: why the last attempt failed, empty if none did
+    :param ended: when the job ended, in seconds of :func:`time.monotonic`
+    """
+
+    spec: RunSpec
+    directory: Path
+    command: list[str]
+    state: str = "waiting"
+    needs: list["Job"] = field(default_factory=list)
+    reason: str = ""
+    ended: float = 0.0
+
+    @property
+    def lacking(self) -> list["Job"]:
+        """Those that it needs, and that will never be finished."""
+        return [job for job in self.needs if job.state in ENDED_BADLY]
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether nothing that it needs is still to come."""
+        return all(job.state not in ("waiting", "running") for job in self.needs)
+
+    @property
+    def log(self) -> Path:
+        """Where the run's output goes, that of all attempts."""
+        return self.directory / "log.txt"
+
+
+def last_evaluation(job: Job) -> tuple[int, float | None]:
+    """
+    :param job: in any state
+    :return: environment steps at the run's last evaluation, and the learner's return there; 0 and ``None`` before the first
+    """
+    try:
+        last = json.loads((job.directory / TIMING).read_text())
+        return int(last["steps"]), float(last["learner"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0, None
+
+
+def count(jobs: Sequence[Job]) -> str:
+    """
+    :param jobs: of this launch
+    :return: how many are in each state
+    """
+    states = Counter(job.state for job in jobs)
+    return ", ".join(f"{states[state]} {state}" for state in reversed(STATES) if states[state] or state not in ENDED_BADLY)
+
+
+def reason_in(log: Path, status: int) -> str:
+    """
+    :param log: with the output of all attempts at a run
+    :param status: with which the last one's process ended, negative for a signal
+    :return: why it failed: the exception at the end of its last traceback; without one, the signal or the last line
+    """
+    lines = _last_attempt(log)
+    tracebacks = [index for index, line in enumerate(lines) if line.startswith("Traceback (most recent call last)")]
+    if tracebacks:
+        said = (line for line in lines[tracebacks[-1] + 1 :] if not line[0].isspace())
+        if exception := next(said, None):
+            return exception
+    if status < 0:
+        name = signal.Signals(-status).name
+        return f"killed by {name}" + (", as when memory runs out" if name == "SIGKILL" else "")
+    return f"{lines[-1]} (exit status {status})" if lines else f"exit status {status}, and no output"
+
+
+def _last_attempt(log: Path) -> list[str]:
+    """Lines that are not empty, of a process's output."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(log.stat().st_size - _READ_AT_MOST, 0))
+            text = file.read().decode(errors="replace")
+    except OSError:
+        return []
+    _, attempt, output = text.rpartition(ATTEMPT)
+    lines = output.splitlines()[1 if attempt else 0 :]  # of which the first is the command
+    return [line for line in lines if line.strip()]
+
+
+class Clock:
+    """
+    How long a launch still takes: from the environment steps that all its runs have made since it began.
+
+    :param jobs: of this launch
+    :param now: the time in seconds
+    """
+
+    def __init__(self, jobs: Sequence[Job], now: Callable[[], float] = time.monotonic):
+        self._jobs, self._now = jobs, now
+        self._before = {id(job): last_evaluation(job)[0] for job in jobs}
+        self._started = self._changed = now()
+        self._made = 0
+
+    def done_of_all(self) -> tuple[int, int]:
+        """Environment steps that are made, and those of all runs that are finished, run or wait."""
+        counted = [job for job in self._jobs if job.state not in ENDED_BADLY]
+        return sum(map(self._done, counted)), sum(job.spec.steps for job in counted)
+
+    def seconds_left(self) -> float | None:
+        """At the pace so far; ``None`` before the first evaluation."""
+        now, made = self._now(), sum(self._done(job) - self._before[id(job)] for job in self._jobs)
+        if made != self._made:
+            self._made, self._changed = made, now
+        if self._made <= 0 or self._changed <= self._started:
+            return None
+        done, of_all = self.done_of_all()
+        seconds_per_step = (self._changed - self._started) / self._made
+        return max((of_all - done) * seconds_per_step - (now - self._changed), 0.0)
+
+    def _done(self, job: Job) -> int:
+        if job.state == "finished":
+            return job.spec.steps
+        if job.state == "waiting":
+            return self._before[id(job)]
+        return min(max(last_evaluation(job)[0], self._before[id(job)]), job.spec.steps)
+
+
+def in_words(seconds: float) -> str:
+    """
+    :param seconds: a duration
+    :return: as people say it
+    """
+    minutes = round(seconds / 60)
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    if minutes < 60:
+        return f"{minutes} min"
+    return f"{minutes // 60:,} h {minutes % 60:02} min"
