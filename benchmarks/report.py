@@ -28,6 +28,7 @@ from benchmarks.page.plots import (
     has_guider,
     is_wanted,
     palette,
+    returns_range,
     steps_label,
     title_of,
 )
@@ -37,6 +38,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 FORMATS = ("png", "pdf", "svg")
+MOST_NAMES = 3  # in a line of the legend below one task
 
 
 def read_tidy(path: Path, own_steps: bool = False) -> pd.DataFrame:
@@ -75,13 +77,17 @@ def draw(tidy: pd.DataFrame, paths: Sequence[Path]) -> None:
                 if has_guider(group):
                     guider = curves(group, "guider")
                     axis.plot(guider.index, guider["mean"], color=color, linestyle="--", linewidth=1)
+            if not cell.empty:
+                axis.set_ylim(returns_range(cell))
             wanted = is_wanted(tidy, task, noise)
             axis.set(title=title_of(task, noise) if wanted else "", xlabel=steps_label(tidy), ylabel=RETURN)
             if cell.empty:
                 axis.set_axis_off()
                 axis.text(0.5, 0.5, NOT_RUN if wanted else "", ha="center", transform=axis.transAxes)
-    shown = next(axis for axis in axes.flat if axis.get_legend_handles_labels()[0])
-    shown.legend(fontsize="small")
+    shown = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    names = [name for name in algorithms if name in shown]
+    columns = min(len(names), MOST_NAMES * len(tasks))
+    figure.legend([shown[name] for name in names], names, loc="outside lower center", ncols=columns, fontsize="small")
     for path in paths:
         figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -1,6 +1,6 @@
 """Curves of a suite's results to hover over and switch off."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -90,8 +90,9 @@ def palette(algorithms: list[str]) -> dict[str, str]:
     """
     if len(algorithms) <= len(COLORS):
         return dict(zip(algorithms, COLORS, strict=False))
-    hues = matplotlib.colormaps["hsv"]
-    return {name: matplotlib.colors.to_hex(hues(index / len(algorithms))) for index, name in enumerate(algorithms)}
+    distinct = matplotlib.colormaps["tab20"].colors if len(algorithms) <= 20 else None  # type: ignore[attr-defined]
+    hues = distinct or [matplotlib.colormaps["hsv"](index / len(algorithms)) for index in range(len(algorithms))]
+    return {name: matplotlib.colors.to_hex(color) for name, color in zip(algorithms, hues, strict=False)}
 
 
 def has_guider(group: pd.DataFrame) -> bool:
@@ -186,10 +187,21 @@ def in_cells(
 
 
 def _range(figure: graph_objects.Figure, place: int) -> tuple[float, float]:
-    """Of a cell's lines: what the intervals of few seeds reach beyond them says nothing more, and would hide the rest."""
     axis = "y" if place == 0 else f"y{place + 1}"
-    values = np.concatenate([line.y for line in figure.data if line.yaxis == axis and line.fill is None] or [[0.0, 1.0]])
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    return _around([line.y for line in figure.data if line.yaxis == axis and line.fill is None])
+
+
+def returns_range(cell: pd.DataFrame) -> tuple[float, float]:
+    """
+    :param cell: evaluations
+    :return: of an axis that holds all runs: what the intervals of few seeds reach beyond them would hide the rest
+    """
+    return _around([cell[column] for column in ("learner", "guider") if column in cell])
+
+
+def _around(values: Sequence[Any]) -> tuple[float, float]:
+    together = np.concatenate([np.asarray(one, dtype=float) for one in values] or [np.array([0.0, 1.0])])
+    low, high = float(np.nanmin(together)), float(np.nanmax(together))
     margin = 0.05 * (high - low) or 1.0
     return low - margin, high + margin
 

@@ -10,7 +10,7 @@ import matplotlib
 import pandas as pd
 import yaml
 
-from benchmarks.page.plots import palette, steps_label, title_of
+from benchmarks.page.plots import NEEDED, palette, title_of
 from benchmarks.report import read_tidy
 from benchmarks.suite import HERE, read_suite
 
@@ -160,6 +160,11 @@ class _Drawn(NamedTuple):
         return min(len(self.cells), max(MOST_ACROSS // panels, 1)) * panels
 
     @property
+    def steps_label(self) -> str:
+        needed = NEEDED in self.tidy and self.tidy[NEEDED].gt(0).any()
+        return "thousand steps, those of needed runs too" if needed else "thousand environment steps"
+
+    @property
     def down(self) -> int:
         return math.ceil(len(self.cells) * len(self.group.panels) / self.across)
 
@@ -171,7 +176,7 @@ def _draw_group(axes: Iterator[Axes], one: _Drawn, colors: Mapping[str, str]) ->
         for panel in one.group.panels:
             axis = next(axes)
             _draw_panel(axis, panel, cell, ends, colors)
-            axis.set(title=title_of(task, noise), xlabel=f"thousand {steps_label(one.tidy)}", ylabel=LABELS[panel])
+            axis.set(title=title_of(task, noise), xlabel=one.steps_label, ylabel=LABELS[panel])
             axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}")
             if first or panel != RETURNS:
                 axis.legend(fontsize="x-small")
