@@ -9,7 +9,7 @@ WORKERS ?= auto
 ARGS ?=
 
 BIN := $(VENV)/bin
-CODE := sb3_gac benchmarks tests
+CODE := sb3_gac benchmarks tests examples
 REUSED := $(if $(REUSE_RESULTS),--reuse-results $(REUSE_RESULTS))
 
 # What is given on the command line; all else has the program's own default

@@ -1,0 +1,35 @@
+"""A teacher that sees everything: cloned before training, with DAgger, and then left behind."""
+
+import argparse
+
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_gac import AsymmetricSAC, clone_behaviour, demonstrate, preset
+from sb3_gac.envs import make_vec
+
+
+def main(steps: int = 20_000) -> None:
+    """Train a teacher on the full state, clone what of it can be done from one noisy position, and train on."""
+    task, noise = "HalfCheetah", 0.1
+    env = make_vec(f"sb3_gac/{task}-v5", 4, seed=0, noise_std=noise)
+    setting = {"algorithm": "asymmetric_sac", "task": task, "noise": noise}
+    arguments = preset("small", **setting, buffer_size=steps, learning_starts=min(2_000, steps // 2))
+    everything = {"actor": ["partial", "privileged"], "critic": ["privileged"]}
+    teacher = AsymmetricSAC("MultiInputPolicy", env, seed=0, **arguments | {"role_keys": everything})
+    teacher.learn(steps)
+
+    model = AsymmetricSAC("MultiInputPolicy", env, seed=0, **arguments)
+    shown = demonstrate(teacher, env, steps // 4)
+    print("cloned:", clone_behaviour(model, shown, gradient_steps=steps // 10))
+    shown += demonstrate(teacher, env, steps // 4, student=model)
+    print("... and corrected where it went:", clone_behaviour(model, shown, gradient_steps=steps // 10))
+    for name, policy in (("teacher", teacher), ("clone", model)):
+        print(f"the {name} returns {evaluate_policy(policy, env, n_eval_episodes=4)[0]:.0f}")
+    model.learn(steps)
+    print(f"trained on, it returns {evaluate_policy(model, env, n_eval_episodes=4)[0]:.0f}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=20_000)
+    main(parser.parse_args().steps)
