@@ -14,7 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.environments import environment, make_envs, normalized
 from benchmarks.external import Program
-from benchmarks.suite import RunSpec, check_is, check_keys, check_numbers, needed_runs, read_definitions, with_needed
+from benchmarks.suite import RunSpec, needed_runs, read_definitions, with_needed
+from benchmarks.yaml_checks import check_is, check_keys, check_numbers
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.base.arguments import present_names
 from sb3_gac.checks.arguments import constructor_parameters

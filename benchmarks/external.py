@@ -29,7 +29,8 @@ from benchmarks.checkpoint import CHECKPOINT, TIMING, read_seconds, write_atomic
 from benchmarks.engines import end_with_parent
 from benchmarks.environments import EVAL_SEED, environment
 from benchmarks.program import REQUEST, Rows, read_rows
-from benchmarks.suite import HERE, RunSpec, check_is
+from benchmarks.suite import HERE, RunSpec
+from benchmarks.yaml_checks import check_is
 
 _ASK = """
 import json, platform, sys

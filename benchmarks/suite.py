@@ -3,13 +3,14 @@
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from benchmarks.yaml_checks import check_is, check_keys, check_list, check_numbers
 from sb3_gac.presets import read_preset
 
 HERE = Path(__file__).parent
@@ -214,8 +215,8 @@ class _Reader:
         where = f"{self._name}, cell {number}"
         check_is(where, cell, "a mapping", Mapping)
         environment, task, noises = self._environment(where, cell)
-        _check_list(f"{where}, seeds", cell["seeds"], "whole numbers", int)
-        _check_list(f"{where}, algorithms", cell["algorithms"], "names", str)
+        check_list(f"{where}, seeds", cell["seeds"], "whole numbers", int)
+        check_list(f"{where}, algorithms", cell["algorithms"], "names", str)
         common = {key: self._suite[key] for key in _COMMON} | {"overrides": self._suite.get("overrides", {})}
         particulars = self._particulars(where, cell)
         for noise in noises:
@@ -244,7 +245,7 @@ class _Reader:
         check_keys(where, cell, _TASK_KEYS, _TASK_KEYS - {"needs", "history"})
         if "history" in cell:
             check_is(f"{where}, history", cell["history"], "a whole number above 1", int, lambda number: number > 1)
-        _check_list(f"{where}, noises", cell["noises"], "numbers", (int, float))
+        check_list(f"{where}, noises", cell["noises"], "numbers", (int, float))
         return None, cell["task"], [float(noise) for noise in cell["noises"]]
 
     def _particulars(self, where: str, cell: Any) -> dict[str, dict[str, Any]]:
@@ -292,12 +293,6 @@ def _checked(where: str, argument: str, needs: Mapping[str, Any]) -> Mapping[str
     return need
 
 
-def _check_list(where: str, values: Any, what: str, kinds: type | tuple[type, ...]) -> None:
-    check_is(where, values, f"a list of at least one of {what}", list, len)
-    for value in values:
-        check_is(where, value, f"{what}, each", kinds, lambda value: isinstance(value, str) or value >= 0)
-
-
 def read_environment(where: str, cell: Mapping[str, Any]) -> dict[str, Any]:
     """
     :param where: for the message
@@ -337,59 +332,3 @@ def _check_kwargs(where: str, kwargs: Any) -> None:
         where, kwargs, "a mapping of keyword arguments", Mapping, lambda kwargs: all(isinstance(key, str) for key in kwargs)
     )
     check_numbers(where, kwargs, lambda value: isinstance(value, str) and _WITH_EXPONENT.fullmatch(value))
-
-
-def check_numbers(where: str, value: Any, is_meant: Callable[[Any], Any] | None = None) -> None:
-    """
-    :param where: for the message
-    :param value: arguments, or what they hold
-    :param is_meant: whether a value must have been meant as a number, :func:`is_number_as_text` by default
-    :raises ValueError: naming a number that YAML reads as text
-    """
-    if (is_meant or is_number_as_text)(value):
-        raise ValueError(f"{where}: YAML reads {value!r} as text: write a number out, or as 1.0e-3 and 1.0e+5.")
-    pairs = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
-    for key, inner in pairs:
-        check_numbers(f"{where}, {key}", inner, is_meant)
-
-
-def check_is(
-    where: str, value: Any, what: str, kinds: type | tuple[type, ...], holds: Callable[[Any], Any] = lambda value: True
-) -> None:
-    """
-    :param where: for the message
-    :param value: read from YAML
-    :param what: it must be, for the message
-    :param kinds: types that it may have
-    :param holds: what else must be so
-    :raises ValueError: if it is something else
-    """
-    if isinstance(value, bool) or not isinstance(value, kinds) or not holds(value):
-        hint = f" YAML reads {value!r} as text: write a number out, or as 1.0e-3." if is_number_as_text(value) else ""
-        raise ValueError(f"{where}: must be {what}, got {value!r}.{hint}")
-
-
-def is_number_as_text(value: Any) -> bool:
-    """
-    :param value: read from YAML, in whose version 1.1 1e-3 is no number and 1.0e-3 is one
-    """
-    if not isinstance(value, str):
-        return False
-    try:
-        float(value)
-    except ValueError:
-        return False
-    return True
-
-
-def check_keys(where: str, mapping: Mapping[str, Any], known: set[str], required: set[str]) -> None:
-    """
-    :param where: for the message
-    :param mapping: read from YAML
-    :param known: keys that it may have
-    :param required: keys that it must have
-    :raises ValueError: if a key is unknown or missing
-    """
-    unknown, missing = sorted(set(mapping) - known), sorted(required - set(mapping))
-    if unknown or missing:
-        raise ValueError(f"{where}: unknown keys {unknown}, missing keys {missing}; the keys are {sorted(known)}.")
