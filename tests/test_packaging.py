@@ -31,7 +31,7 @@ PARTS = {  # extra -> what of it is needed, and what needs it
     "benchmarks, report": (["plotly"], "import benchmarks.report"),
     "benchmarks, aggregate": (["rliable"], "import benchmarks.aggregate"),
     "benchmarks, run": (["tensorboard"], "import benchmarks.run"),
-    "dreamer": (["sheeprl"], "import benchmarks.dreamer"),
+    "dreamer": (["sheeprl", "omegaconf"], "import benchmarks.dreamer"),
     "ray": (["ray"], "from benchmarks.engines import RayEngine; RayEngine('auto')"),
 }
 
@@ -54,7 +54,7 @@ def test_extras_bring_what_their_parts_need():
     for part, (modules, _) in PARTS.items():
         lines = parser["options.extras_require"][part.split(",")[0]].split("\n")
         names = {Requirement(line).name for line in lines if line}
-        assert set(modules) - {"optuna"} <= names, "optuna comes with rl_zoo3"
+        assert set(modules) - {"optuna", "omegaconf"} <= names, "which come with rl_zoo3 and sheeprl"
 
 
 def test_an_editable_installation_is_a_path_that_type_checkers_follow(tmp_path):

@@ -141,6 +141,20 @@ def test_between_two_noises_numbers_are_interpolated_which_is_said():
         assert preset("paper", task="Ant", noise=0.7)["target_kl"] == 0.001
 
 
+def test_below_the_first_noise_there_is_what_the_task_has_and_nothing_is_said(tmp_path, monkeypatch):
+    content = {
+        "run": {"envs": 1},
+        "arguments": {"gac": {"tau": 0.2}},
+        "tasks": {"Own": {"arguments": {"gac": {"gamma": 0.9}}, "noises": {0.2: {"gac": {"tau": 0.4, "gamma": 0.5}}}}},
+    }
+    (tmp_path / "own.yml").write_text(yaml.safe_dump(content))
+    monkeypatch.setattr(sb3_gac.presets, "DIRECTORY", tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = preset("own", task="Own", noise=0.1)
+    assert (found["tau"], found["gamma"]) == (0.2, 0.9)
+
+
 def test_nothing_is_said_where_an_algorithm_has_nothing_by_noise():
     with warnings.catch_warnings():
         warnings.simplefilter("error")

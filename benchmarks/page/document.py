@@ -96,8 +96,8 @@ def _as_data(plot: Plot) -> dict[str, Any]:
 def _notes() -> str:
     return (
         "<p class=note>Bold: the highest mean of its cell. The end is the last evaluation. The interval of the mean is by "
-        "Student's t. The interquartile mean of three or fewer seeds is their mean, and has no column. A click on a column's "
-        "name sorts.</p>"
+        "Student's t. The interquartile mean (IQM), with rliable's bootstrap interval, is shown of more than three seeds: of "
+        "fewer it is their mean. A click on a column's name sorts.</p>"
     )
 
 

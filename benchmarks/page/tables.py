@@ -9,6 +9,8 @@ import numpy as np
 
 from benchmarks.intervals import mean_interval
 
+#: So many seeds have an interquartile mean that is their mean
+SAME_MEAN = 3
 _SHORT = 30  # letters that are not to be broken
 
 
@@ -59,7 +61,17 @@ def returns_table(cells: Sequence[Mapping[str, Any]]) -> str:
     :param cells: as aggregated
     :return: HTML: a row for each algorithm in each cell, the best of a cell in bold
     """
-    head = ["task", "noise", "algorithm", "mean at the end", "95% interval", "each seed", "mean of the curve", "guider"]
+    head = [
+        "task",
+        "noise",
+        "algorithm",
+        "mean at the end",
+        "95% interval",
+        "IQM [95%]",
+        "each seed",
+        "mean of the curve",
+        "guider",
+    ]
     head += ["KL / target", "steps to the reference's end"]
     best = _best(cells)
     rows = [(list(_returns(cell)), id(cell) in best) for cell in cells]
@@ -85,6 +97,8 @@ def _returns(cell: Mapping[str, Any]) -> Iterator[Field]:
     yield number(cell["final_mean"])
     _, low, high = mean_interval(np.array(cell["final"], dtype=float))
     yield Field("one seed" if math.isinf(low) else f"{low:,.0f} to {high:,.0f}")
+    iqm, low, high = cell["final_iqm"]
+    yield Field(f"{iqm:.0f} [{low:.0f}, {high:.0f}]", iqm) if len(cell["final"]) > SAME_MEAN else number(None)
     yield Field(", ".join(f"{value:,.0f}" for value in cell["final"]))
     yield number(cell["area_iqm"][0])
     yield number(cell.get("guider_mean"))

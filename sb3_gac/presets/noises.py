@@ -17,8 +17,9 @@ def at_noise(
     :param by_noise: noise -> arguments there, the later over the earlier
     :param noise: standard deviation that arguments are wanted for
     :param below: arguments that hold where ``by_noise`` has none
-    :return: those of the same noise, but for rounding. Between two noises numbers are interpolated, and all else is that of
-        the nearer one; beyond the last it is the last one's. Either is said in a warning
+    :return: those of the same noise, but for rounding; none below the first noise, where ``below`` holds. Between two noises
+        numbers are interpolated, and all else is that of the nearer one; beyond the last it is the last one's. Either of
+        these is said in a warning
     :raises ValueError: if the noise is negative, or no number
     """
     if not (_is_number(noise) and noise >= 0):
@@ -27,8 +28,10 @@ def at_noise(
         if math.isclose(noise, level, **_ROUNDING):
             return list(layers)
     lower = max((level for level in by_noise if level < noise), default=None)
+    if lower is None:
+        return []
     upper = min((level for level in by_noise if level > noise), default=None)
-    ends = [level for level in (lower, upper) if level is not None]
+    ends = [lower] if upper is None else [lower, upper]
     names = {name for level in ends for layer in by_noise[level] for name in layer}
     if not names:
         return []

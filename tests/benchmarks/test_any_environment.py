@@ -152,8 +152,8 @@ def test_from_suite_to_report_beside_a_task_with_noise(suite, tmp_path, monkeypa
     _main(monkeypatch, benchmarks.report, out)
     assert "| my-line |  | gac | 12 |" in capsys.readouterr().out
     page = out.with_suffix(".html").read_text()
-    assert '"text":"my-line"' in page
-    assert '"text":"Pendulum, noise 0.1"' in page
+    assert '"text": "my-line"' in page
+    assert '"text": "Pendulum, noise 0.1"' in page
     assert "my-line, noise" not in page
     assert '"text":"not run yet"' not in page, "where a task has no noise, nothing is missing"
 

@@ -169,7 +169,7 @@ def test_what_is_wrong_is_said_before_the_first_run(engine, monkeypatch, argumen
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--seeds", "0"], "must be at least 1"),
+        (["--seeds", "0"], "must be an integer of at least 1"),
         (["--env-kwargs", "noise"], "must be a mapping"),
         (["--env-kwargs", "{noise: ["], "is no YAML"),
         (["--algorithms", "ppo"], "invalid choice: 'ppo'"),

@@ -13,6 +13,7 @@ def _cell(algorithm, final, noise=0.1, **more):
     mean = sum(final) / len(final)
     return {"task": "T", "noise": noise, "algorithm": algorithm, "seeds": list(range(len(final))), "final": final} | {
         "final_mean": mean,
+        "final_iqm": [mean + 0.4, 1.0, 9.0],
         "area_iqm": [mean / 2, 0.0, 0.0],
         "steps_to_reference": None,
         **more,
@@ -73,6 +74,8 @@ def test_the_returns_table_has_students_interval_and_the_best_in_bold():
     assert "guider" not in shown, "a column of which all fields are empty"
     assert "guider" in returns_table([_cell("gac", [1.0], guider_mean=2.0)])
     assert "one seed" in returns_table([_cell("gac", [1.0])])
+    assert "IQM" not in shown, "which is the mean of three seeds"
+    assert "4 [1, 9]" in returns_table([_cell("gac", [1.0, 2.0, 4.0, 8.0])])
 
 
 def test_the_better_algorithm_is_the_first_row_of_the_overall_table():

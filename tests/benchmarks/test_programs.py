@@ -248,13 +248,16 @@ def test_results_that_do_not_name_their_runs_are_refused(tmp_path):
 def test_a_failing_run_is_named_with_its_log(tmp_path, program):
     suite = yaml.safe_load(SMOKE.read_text())
     suite["cells"] = [{"task": "InvertedDoublePendulum", "noises": [0.1], "algorithms": ["gac"], "seeds": [0]}]
-    suite["overrides"]["tau"] = 2
     path = tmp_path / "broken.yml"
     path.write_text(yaml.safe_dump(suite))
-    printed = program("benchmarks.launch", path, "--runs", tmp_path, "--retries", 1, fails=True)
     log = tmp_path / "small-600" / "InvertedDoublePendulum-noise0.1" / "gac" / "seed0" / "log.txt"
+    log.parent.mkdir(parents=True)
+    (log.parent / "config.yaml").write_text(
+        "run: {}\narguments: {}\n"
+    )  # of another run, which is not to be mixed with this one
+    printed = program("benchmarks.launch", path, "--runs", tmp_path, "--retries", 1, fails=True)
     assert f"FAILED, see {log}" in printed.replace("\n", "")
-    assert "tau must be a number from 0 to 1, got 2" in log.read_text()
+    assert "holds an unfinished run with other settings under ['run', 'arguments']" in log.read_text()
     assert log.read_text().count("--- attempt") == 2
 
 
