@@ -6,6 +6,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,15 +37,21 @@ def run_process(command: list[str], log: Path) -> int:
             stderr=subprocess.STDOUT,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
             cwd=HERE.parent,
-            preexec_fn=end_with_parent,
+            preexec_fn=partial(end_with_parent, os.getpid()),
             check=False,
         ).returncode
 
 
-def end_with_parent() -> None:
-    """In a process that begins: it is killed when the thread that started it ends. Not so elsewhere than on Linux."""
+def end_with_parent(parent: int) -> None:
+    """
+    In a process that begins: it is killed when the thread that started it ends. Not so elsewhere than on Linux.
+
+    :param parent: number of the process that starts it, which may have ended before this is called
+    """
     if _prctl:
         _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
 
 
 class LocalEngine:

@@ -22,6 +22,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -145,7 +146,8 @@ def _watch(command: list[str], directory: Path) -> Rows:
     rows, started = read_rows(directory), time.time()
     before = read_seconds(directory / TIMING) if rows else 0.0
     path = os.pathsep.join(filter(None, [str(HERE.parent), os.environ.get("PYTHONPATH")]))
-    process = subprocess.Popen(command, cwd=HERE.parent, env={**os.environ, "PYTHONPATH": path}, preexec_fn=end_with_parent)
+    ends = partial(end_with_parent, os.getpid())
+    process = subprocess.Popen(command, cwd=HERE.parent, env={**os.environ, "PYTHONPATH": path}, preexec_fn=ends)
     status = None
     while status is None:
         with suppress(subprocess.TimeoutExpired):
