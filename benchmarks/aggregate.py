@@ -22,8 +22,6 @@ from rliable import metrics
 from benchmarks.bootstrap import Estimate, estimate, improvements, interval
 from benchmarks.finished import (
     NAMES,
-    NEEDED,
-    NO_NOISE,
     FinishedRun,
     add_reuse_options,
     kind_of,
@@ -32,10 +30,10 @@ from benchmarks.finished import (
     particulars_of,
     read_directory,
     read_reused,
-    read_tidy,
     settings_of,
 )
 from benchmarks.suite import HERE, RUNS, needed_steps, read_cells
+from benchmarks.tidy import NEEDED, NO_NOISE, read_tidy
 
 CELL = ["task", "noise"]
 REFERENCE = "sac-asym"

@@ -18,9 +18,9 @@ from benchmarks import aggregate, launch
 from benchmarks.comparison_page import page
 from benchmarks.config import check_programs, check_simulators
 from benchmarks.environments import EVAL_SEED, make_envs
-from benchmarks.finished import read_tidy
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, findings, recommendation, worth
 from benchmarks.suite import NAME, RunSpec, default_name, read_definitions, read_suite
+from benchmarks.tidy import read_tidy
 from benchmarks.yaml_checks import check_is
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 from sb3_gac.optim.compile import PAYS_FROM, missing_compiler

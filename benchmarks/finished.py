@@ -13,13 +13,10 @@ import yaml
 
 from benchmarks.config import in_present_names, read_algorithm, resolve, settings_in_present_names
 from benchmarks.suite import RunSpec, made_with
+from benchmarks.tidy import NEEDED, NO_NOISE, read_tidy
 
 #: What tells a suite's runs apart
 NAMES = ["task", "noise", "algorithm", "seed"]
-#: In the place of a noise, for environments that are not asked for one; an empty field in files
-NO_NOISE = -1.0
-#: Environment steps of the runs that a run needs
-NEEDED = "needed_steps"
 _PARTICULARS = ["environment", "definition", "needs", "history"]
 
 
@@ -79,14 +76,6 @@ def particulars_of(spec: RunSpec) -> dict[str, Any]:
     :return: what not all runs of its suite have: an environment that is no registered task, a definition, needs, a history
     """
     return {name: value for name, value in asdict(spec).items() if name in _PARTICULARS and value is not None}
-
-
-def read_tidy(path: Path) -> pd.DataFrame:
-    """
-    :param path: of an aggregated CSV
-    :return: its rows
-    """
-    return pd.read_csv(path, dtype={"noise": float}).fillna({"noise": NO_NOISE})
 
 
 def settings_of(spec: RunSpec) -> dict[str, Any]:

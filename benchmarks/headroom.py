@@ -17,9 +17,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from benchmarks.finished import read_tidy
 from benchmarks.intervals import CONFIDENCE, Difference, difference, mean_interval
 from benchmarks.page.summary import listed
+from benchmarks.tidy import read_tidy
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"

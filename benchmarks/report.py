@@ -19,8 +19,6 @@ import pandas as pd
 
 from benchmarks.page.document import page
 from benchmarks.page.plots import (
-    NEEDED,
-    NO_NOISE,
     NOT_RUN,
     RETURN,
     curves,
@@ -33,24 +31,13 @@ from benchmarks.page.plots import (
     title_of,
 )
 from benchmarks.page.plots import interactive as interactive  # the returns of the page, as a figure of plotly's
+from benchmarks.tidy import NEEDED, read_tidy, with_needed_steps
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 FORMATS = ("png", "pdf", "svg")
 MOST_NAMES = 3  # in a line of the legend below one task
-
-
-def read_tidy(path: Path, own_steps: bool = False) -> pd.DataFrame:
-    """
-    :param path: of an aggregated CSV
-    :param own_steps: whether a run's steps are counted from its own start, not from that of the first run that it needs
-    :return: its rows
-    """
-    tidy = pd.read_csv(path).fillna({"noise": NO_NOISE})
-    if own_steps or NEEDED not in tidy:
-        return tidy.drop(columns=NEEDED, errors="ignore")
-    return tidy.assign(timesteps=tidy.timesteps + tidy[NEEDED])
 
 
 def draw(tidy: pd.DataFrame, paths: Sequence[Path]) -> None:
@@ -151,7 +138,8 @@ def main() -> None:
     )
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS, help="of the figure (default: all)")
     options = parser.parse_args()
-    tidy = read_tidy(options.results.with_suffix(".csv"), options.own_steps)
+    tidy = read_tidy(options.results.with_suffix(".csv"))
+    tidy = tidy.drop(columns=NEEDED, errors="ignore") if options.own_steps else with_needed_steps(tidy)
     results = json.loads(options.results.with_suffix(".json").read_text())
     draw(tidy, [options.results.with_suffix(f".{suffix}") for suffix in options.formats])
     runs = os.path.relpath(options.runs, options.results.parent)

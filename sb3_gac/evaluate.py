@@ -12,14 +12,12 @@ seeds: the same first states, and the same noise but for its size.  The learner 
 import argparse
 import json
 import os
-import platform
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from ctypes.util import find_library
 from dataclasses import asdict, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -53,13 +51,12 @@ from sb3_gac.evaluation.settings import (
     plan,
 )
 from sb3_gac.evaluation.video import check_can_film, film
-from sb3_gac.version import __version__
+from sb3_gac.training.provenance import provenance
 
 EVAL_SEED = 10_000
 STATISTICS = "vecnormalize.pkl"  # where rl_zoo3 and the benchmarks have them
 SIDE_BY_SIDE = 10  # environments: more save little, since they are stepped one after the other
 WIDTHS = (5, 5, 5, 7, 7, 6, 18, 5, 25, 7)  # of the table's columns, before its cells are known
-PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:
@@ -232,7 +229,7 @@ class Evaluation:
         seeds = [self.options.seed, self.options.seed + self.options.episodes - 1]
         return {
             "command": command,
-            "versions": versions(),
+            **provenance(),
             "model": str(self.file),
             "algorithm": self.algorithm,
             "environment": asdict(self.environment),
@@ -264,17 +261,6 @@ class Evaluation:
 
 def _cells(texts: Sequence[str]) -> str:
     return "| " + " | ".join(text.ljust(width) for text, width in zip(texts, WIDTHS, strict=False)) + " |"
-
-
-def versions() -> dict[str, str]:
-    """Of what the numbers depend on."""
-    found = {"sb3_gac": __version__, "python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

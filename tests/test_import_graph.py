@@ -20,9 +20,9 @@ ROOMS = {
     "checkpoint": "checkpoint|envs",
     "base": "algorithms|base|math|checks|schedules|optim|networks|replay|checkpoint|envs",
     "deploy": "deploy|base|checks|networks|envs|learner|version",
-    "evaluation": "evaluation|algorithms|base|envs|learner",
+    "evaluation": "evaluation|algorithms|base|envs|learner|training\\.environments",
 }
-DRAWING = "page|intervals|bootstrap"
+DRAWING = "page|intervals|bootstrap|tidy"
 FORBIDDEN = {
     **{f"sb3_gac/{room}/**/*.py": rf"sb3_gac(?!\.({allowed})\b)" for room, allowed in ROOMS.items()},
     **{f"sb3_gac/envs/{path}.py": r"torch\b|stable_baselines3|sb3_gac(?!\.envs\b)" for path in ("*", "suites/**/*")},
@@ -41,7 +41,7 @@ FORBIDDEN = {
     "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
     **{f"benchmarks/{path}.py": rf"torch\b|sb3_gac\b|benchmarks(?!\.({DRAWING})\b)" for path in ("report", "page/**/*")},
-    **{f"benchmarks/{name}.py": r"torch\b|sb3_gac\b|benchmarks\b" for name in ("intervals", "bootstrap")},
+    **{f"benchmarks/{name}.py": r"torch\b|sb3_gac\b|benchmarks\b" for name in ("intervals", "bootstrap", "tidy")},
     "benchmarks/**/*.py": r"sb3_gac\.(.*\.)?_(?!_)",
 }
 

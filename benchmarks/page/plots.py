@@ -12,12 +12,11 @@ from plotly.subplots import make_subplots
 
 from benchmarks.bootstrap import profile
 from benchmarks.intervals import mean_interval
+from benchmarks.tidy import NEEDED, NO_NOISE
 
 COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#7f7f7f")
 STEPS, RETURN, NOT_RUN = "environment steps", "return", "not run yet"
 WITH_NEEDED = "environment steps, with those of needed runs"
-NO_NOISE = -1.0  # in the place of a noise, for environments that are not asked for one
-NEEDED = "needed_steps"
 ROW_HEIGHT, FRAME = 330, 110
 Lines = Callable[[pd.DataFrame, str, str], list[graph_objects.Scatter]]
 

@@ -10,9 +10,9 @@ import matplotlib
 import pandas as pd
 import yaml
 
-from benchmarks.page.plots import NEEDED, palette, title_of
-from benchmarks.report import read_tidy
+from benchmarks.page.plots import palette, title_of
 from benchmarks.suite import HERE, read_suite
+from benchmarks.tidy import NEEDED, read_tidy, with_needed_steps
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -95,7 +95,7 @@ def results_of(suites: Sequence[str]) -> pd.DataFrame:
     :return: the aggregated evaluations of all that there are; steps of needed runs count
     """
     paths = [RESULTS / f"{name}.csv" for name in suites]
-    frames = [read_tidy(path) for path in paths if path.exists()]
+    frames = [with_needed_steps(read_tidy(path)) for path in paths if path.exists()]
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=["task", "noise", "algorithm"])
 
 

@@ -193,19 +193,24 @@ def _as_tensors(policy: AsymmetricPolicy, demonstrations: Demonstrations) -> tup
     actions = np.asarray(demonstrations.actions).reshape(len(demonstrations), -1)
     if count != len(actions):
         raise ValueError(f"demonstrations have {count} observations and {len(actions)} actions: there must be one for each.")
-    outside = [index for index, action in enumerate(actions) if not _is_action(space, action)]
-    if outside:
-        raise ValueError(f"demonstrations: action {outside[0]} is {actions[outside[0]]}, which is not in {space}.")
+    inside = _are_in(space, actions)
+    if not inside.all():
+        index = int(inside.argmin())
+        raise ValueError(f"demonstrations: action {index} is {actions[index]}, which is not in {space}.")
     if isinstance(space, spaces.Box):
         actions = policy.scale_action(actions.reshape(-1, *space.shape)).reshape(count, -1)
         return observations, th.as_tensor(actions, dtype=th.float32, device=policy.device)
     return observations, th.as_tensor(actions[:, 0].astype(np.int64), device=policy.device)
 
 
-def _is_action(space: spaces.Space, action: np.ndarray) -> bool:
+def _are_in(space: spaces.Space, actions: np.ndarray) -> np.ndarray:
+    """Whether each row is an action, shape (N,)."""
+    if actions.shape[1] != int(np.prod(space.shape or ())):  # of a choice, 1
+        return np.zeros(len(actions), dtype=bool)
     if isinstance(space, spaces.Box):
-        return action.size == int(np.prod(space.shape)) and space.contains(action.reshape(space.shape).astype(space.dtype))
-    return action.size == 1 and space.contains(int(action[0]))
+        return np.all((actions >= space.low.ravel()) & (actions <= space.high.ravel()), axis=1)
+    assert isinstance(space, spaces.Discrete)
+    return np.isin(actions[:, 0], np.arange(space.n))
 
 
 def _loss(policy: AsymmetricPolicy, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:

@@ -15,6 +15,7 @@ from sb3_gac.algorithms import import_path
 from sb3_gac.envs.disturbances import disturb
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.suites import SUITES, batch_factory, env_id_of, is_batched, suite_of
+from sb3_gac.training.environments import in_wrappers
 
 CONFIGURATION = "config.yaml"
 #: What is evaluated if nothing else is asked for
@@ -85,9 +86,7 @@ class Environment:
         values = {ARGUMENTS[name]: value for name, value in setting._asdict().items()}
         own = {name: value for name, value in values.items() if name in self._parameters}
         rendering = {} if render_mode is None else {"render_mode": render_mode}
-        env = self._creator(**{**self.kwargs, **own, **rendering})
-        for path, arguments in (item for wrapper in self.wrappers for item in wrapper.items()):
-            env = import_path(path)(env, **arguments)
+        env = in_wrappers(self._creator(**{**self.kwargs, **own, **rendering}), self.wrappers)
         entries = getattr(env.observation_space, "spaces", {})
         if PARTIAL not in entries:
             raise ValueError(f'{self.env_id} has no entry "{PARTIAL}" in its observations: {env.observation_space}.')

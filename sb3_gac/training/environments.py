@@ -47,7 +47,15 @@ def make_wrapped(env_id: str, kwargs: Mapping[str, Any], wrappers: Sequence[Mapp
     :param wrappers: from the inside to the outside, each ``module:Class`` and its keyword arguments
     :raises ValueError: if a wrapper can't be imported
     """
-    env = _make(env_id, kwargs)
+    return in_wrappers(_make(env_id, kwargs), wrappers)
+
+
+def in_wrappers(env: gym.Env, wrappers: Sequence[Mapping[str, Mapping[str, Any]]]) -> gym.Env:
+    """
+    :param env: to be wrapped
+    :param wrappers: see :func:`make_wrapped`
+    :raises ValueError: if a wrapper can't be imported
+    """
     for wrapper in wrappers:
         for path, arguments in wrapper.items():
             env = import_path(path)(env, **arguments)
