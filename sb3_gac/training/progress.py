@@ -44,11 +44,12 @@ class Progress(BaseCallback):
         if self.model.compile_decision:  # type: ignore[attr-defined]
             print(self.model.compile_decision, flush=True)  # type: ignore[attr-defined]
         if sys.stderr.isatty():
-            self._bar = tqdm(
-                total=self._total, initial=self.num_timesteps, bar_format=_BAR, dynamic_ncols=True, mininterval=0.2, leave=True
-            )
+            start: dict[str, Any] = {"total": self._total, "initial": self.num_timesteps}
+            # Not shown before it is whole: until then notes are not written above it, but behind it.
+            start["delay"] = 1e-9
+            self._bar = tqdm(**start, bar_format=_BAR, dynamic_ncols=True, mininterval=0.2, leave=True)
             self.model.learn_scope.callback(self._bar.close)  # type: ignore[attr-defined]
-        self._show()
+        self._show(refresh=True)
 
     def _on_rollout_start(self) -> None:
         self._logged.update({name: value for name, value in self.logger.name_to_value.items() if "kl" in name})
