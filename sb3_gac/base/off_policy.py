@@ -98,6 +98,7 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
     """
 
     argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = OFF_POLICY_CHECKS
+    compiled_settings = (*AsymmetricAlgorithm.compiled_settings, "tau")
     restored_arguments = (*AsymmetricAlgorithm.restored_arguments, "ent_coef")
     fixed_arguments = (*AsymmetricAlgorithm.fixed_arguments, "buffer_size", "replay_buffer_class")
     progress = (*AsymmetricAlgorithm.progress, *DataCollection.collected)
@@ -372,10 +373,15 @@ class AsymmetricOffPolicyAlgorithm(AsymmetricAlgorithm, DataCollection):  # type
             for _ in range(gradient_steps):
                 batch = self._sample_batch(batch_size)
                 self._resting = at_rest.union(name for name, every in update_every.items() if self._n_updates % every)
-                history.append(self._compiled("update", self.update, batch) if self._is_one_program else self.update(batch))
+                follow_now = targets_follow and (self._n_updates + 1) % self.target_update_interval == 0
+                step = self._update_with_targets if follow_now else self.update
+                history.append(self._compiled(step.__name__, step, batch) if self.compiles else step(batch))
                 self._n_updates += 1
-                if targets_follow and self._n_updates % self.target_update_interval == 0:
-                    self.policy.update_targets(self.tau)
+
+    def _update_with_targets(self, batch: Batch) -> Metrics:
+        metrics = self.update(batch)
+        self.policy.update_targets(self.tau)
+        return metrics
 
     def _waits_for_an_episode(self) -> bool:
         """Whether there is nothing yet to learn from; said once. (A full buffer without a whole episode is an error.)"""

@@ -134,7 +134,7 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
         """A round of gradient steps on the rollout that was just collected."""
         with self.gradient_steps_under_way() as history:
             for batch in self._minibatches():
-                history.append(self._compiled("update", self.update, batch) if self._is_one_program else self.update(batch))
+                history.append(self._compiled("update", self.update, batch) if self.compiles else self.update(batch))
             self._n_updates += self.n_epochs
         buffer = self.rollout_buffer
         explained = explained_variance(buffer.values.flatten(), buffer.returns.flatten())

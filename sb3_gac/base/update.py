@@ -24,15 +24,11 @@ class _Step(NamedTuple):
     """
     A step that waits for :meth:`GradientSteps.joined`.
 
-    :param networks: see :meth:`GradientSteps.minimize`
-    :param take: what takes it, given the tensors
-    :param tensors: of the loss
+    :param take: what takes it
     :param metrics: filled when it has been taken
     """
 
-    networks: str | tuple[str, ...]
-    take: Callable[..., Metrics]
-    tensors: tuple[Any, ...]
+    take: Callable[[], Metrics]
     metrics: Metrics
 
 
@@ -47,7 +43,7 @@ def _scheduled(minimize: Callable[..., Metrics]) -> Callable[..., Metrics]:
     def scheduled(self: Any, networks: str | tuple[str, ...], loss: Callable[..., Loss], *tensors: Any) -> Metrics:
         if self._worker is None:
             return minimize(self, networks, loss, *tensors)
-        step = _Step(networks, partial(minimize, self, networks, loss), tensors, Metrics())
+        step = _Step(partial(minimize, self, networks, loss, *tensors), Metrics())
         self._branches[self._runs_beside(networks)].append(step)
         return step.metrics
 
@@ -123,20 +119,10 @@ class GradientSteps(Compilation):
         if self._worker is not None:
             beside, here = self._branches[True], self._branches[False]
             self._branches = {True: [], False: []}
-            self._worker.submit(partial(self._run_branch, beside))
-            self._run_branch(here)
+            self._worker.submit(partial(_take, beside))
+            _take(here)
             self._worker.wait()
         return {name: value for step in steps for name, value in step.items()}
-
-    def _run_branch(self, steps: Sequence[_Step]) -> None:
-        """One after the other; compiled, as one program."""
-
-        def run(*tensors: Any) -> list[Metrics]:
-            return [step.take(*own) for step, own in zip(steps, tensors, strict=True)]
-
-        name, tensors = tuple(step.networks for step in steps), [step.tensors for step in steps]
-        for step, found in zip(steps, self._compiled(name, run, *tensors) if self.compiles else run(*tensors), strict=True):
-            step.metrics.update(found)
 
     def outputs(self, batch: Batch, *roles: str) -> list[Outputs]:
         """
@@ -148,7 +134,8 @@ class GradientSteps(Compilation):
         found: dict[str, Outputs] = {}
 
         def run(role: str) -> None:
-            found[role] = self._outputs_of(role, batch)
+            with self._precision():
+                found[role] = batch.outputs(getattr(self.policy, role))
 
         for role in roles:
             self._worker.submit(partial(run, role)) if self._runs_beside(role) else run(role)  # type: ignore[union-attr]
@@ -158,29 +145,6 @@ class GradientSteps(Compilation):
 
     def _runs_beside(self, networks: str | tuple[str, ...]) -> bool:
         return self._worker is not None and networks in self.policy.side_branch
-
-    def _outputs_of(self, role: str, batch: Batch) -> Outputs:
-        def run(batch: Batch) -> Outputs:
-            with self._precision():
-                return batch.outputs(getattr(self.policy, role))
-
-        if not self._in_several_programs:
-            return run(batch)
-        with th.no_grad():
-            return self._compiled(("outputs", role), run, batch)
-
-    def now(self, role: str, outputs: Outputs, batch: Batch) -> Any:
-        """
-        What a loss differentiates by.
-
-        :param role: a policy
-        :param outputs: what :meth:`outputs` returned of it
-        :param batch: that was computed for
-        :return: its distributions for the observations, with their gradient, which does not pass from program to program
-        """
-        if not self._in_several_programs:
-            return outputs.now
-        return getattr(self.policy, role).distribution(batch.observations)
 
     def bellman_loss(self, name: str, batch: Batch, target: th.Tensor) -> Loss:
         r"""
@@ -215,22 +179,13 @@ class GradientSteps(Compilation):
         history: list[Metrics] = []
         self._branches = {True: [], False: []}
         try:
-            with worker(self._branches_are_independent and th.get_num_threads() > 1) as self._worker:
+            in_branches = self._branches_are_independent and not self.compiles and th.get_num_threads() > 1
+            with worker(in_branches) as self._worker:
                 yield history
         finally:
             self._worker = None
             del self._branches
         self._record_metrics(history)
-
-    @property
-    def _is_one_program(self) -> bool:
-        """Whether a whole update is compiled."""
-        return self.compiles and self._worker is None
-
-    @property
-    def _in_several_programs(self) -> bool:
-        """Whether each branch is compiled by itself."""
-        return self.compiles and self._worker is not None
 
     def _compiled(self, name: Any, function: Callable[..., Any], *args: Any) -> Any:
         """
@@ -289,6 +244,12 @@ class GradientSteps(Compilation):
         coefficients = {name: coefficient.value for name, coefficient in self.coefficients.items()}
         check_finite_metrics(self, values, self._last_metrics, coefficients)
         self._last_metrics = values
+
+
+def _take(steps: Sequence[_Step]) -> None:
+    """One after the other."""
+    for step in steps:
+        step.metrics.update(step.take())
 
 
 def _split(gradients: Sequence[th.Tensor], counts: Sequence[int]) -> Iterator[Sequence[th.Tensor]]:

@@ -153,7 +153,7 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
         (actor,) = self.outputs(batch, "actor")
         with th.no_grad():
             (target,) = self.outputs(batch, "actor_target")
-        fits = dict(zip(FITS, self.now("actor", actor, batch).decoupled(target.now), strict=False))
+        fits = dict(zip(FITS, actor.now.decoupled(target.now), strict=False))
         kls = {name: target.now.kl_by_dimension(fit) for name, fit in fits.items()}
         metrics = self.minimize("critic", self.critic_loss, batch, target, noise[0])
         metrics |= self.minimize("actor", self.actor_loss, batch, fits, kls, target, noise[1], temperature.value)

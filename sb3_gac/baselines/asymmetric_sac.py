@@ -104,7 +104,7 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """Climb the critics, with entropy."""
-        now = self.now("actor", actor, batch)
+        now = actor.now
         groups = self.groups(batch.q_at_obs(self.policy.critic))
         q, log_prob = now.value_and_log_prob(lambda actions: _mean_of_minima([group(actions) for group in groups]), noise)
         seen = {f"actor_{name}": masked_mean(values, batch.mask) for name, values in now.diagnostics().items()}

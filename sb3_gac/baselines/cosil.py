@@ -141,7 +141,7 @@ class COSIL(AsymmetricOffPolicyAlgorithm):
 
     def actor_loss(self, batch: Batch, student: Outputs, noise: th.Tensor, alpha: th.Tensor) -> Loss:
         """alpha D - min Q."""
-        now = self.now("actor", student, batch)
+        now = student.now
         q, _ = now.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
         divergence = self.divergence(now, batch.observations)
         seen = {f"actor_{name}": masked_mean(values, batch.mask) for name, values in now.diagnostics().items()}

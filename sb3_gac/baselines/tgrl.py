@@ -146,7 +146,7 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor, c: th.Tensor) -> Loss:
         """beta log pi - min Q_R + c (KL - min Q_I)."""
-        now = self.now("actor", actor, batch)
+        now = actor.now
         q, log_prob = now.value_and_log_prob(batch.q_at_obs(self.policy.reward_critic), noise)
         q_teacher, _ = now.value_and_log_prob(batch.q_at_obs(self.policy.teacher_critic), noise)
         kl = now.kl(self.frozen["teacher"](batch.observations))
@@ -157,9 +157,7 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
 
     def auxiliary_loss(self, batch: Batch, auxiliary: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """beta log pi_R - min Q_R."""
-        q, log_prob = self.now("auxiliary", auxiliary, batch).value_and_log_prob(
-            batch.q_at_obs(self.policy.reward_critic), noise
-        )
+        q, log_prob = auxiliary.now.value_and_log_prob(batch.q_at_obs(self.policy.reward_critic), noise)
         return Loss(policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask), {})
 
     # --- collecting ---------------------------------------------------------------------------------------------------

@@ -245,7 +245,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
     ) -> Loss:
         """Eq. 13: climb the guided critics, close to the learner as it is."""
-        now = self.policy.action_distributions(self.now("guider", guider, batch), learner.now.detach())
+        now = self.policy.action_distributions(guider.now, learner.now.detach())
         q, log_prob = now.guider.value_and_log_prob(batch.q_at_obs(self.policy.guider_critic), noise)
         kl = now.guider.kl_of_means(now.learner, self.kl_reduction)
         loss = policy_loss(q=q, log_prob=log_prob, ent_coef=beta, kl=kl, kl_coef=alpha, mask=batch.mask)
@@ -274,7 +274,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
     ) -> Loss:
         """Eq. 16, and the fit of what serves at deployment alone."""
-        now = self.policy.action_distributions(guider.now.detach(), self.now("learner", learner, batch))
+        now = self.policy.action_distributions(guider.now.detach(), learner.now)
         loss = self.learner_objective(batch, now, noise, alpha, beta)
         fits = self.policy.learner.deployment_losses(now.deployed, now.learner, batch.mask)
         seen = {f"learner_{name}": masked_mean(values, batch.mask) for name, values in now.learner.diagnostics().items()}

@@ -88,7 +88,7 @@ def test_targets_follow_at_their_interval():
     model = small_model(target_update_interval=3, learning_starts=1000)
     model.learn(30)
     updates = []
-    model.policy.update_targets = lambda tau: updates.append((model._n_updates, tau))
+    model.policy.update_targets = lambda tau: updates.append((model._n_updates + 1, tau))
     for _ in range(7):
         model.train(gradient_steps=1, batch_size=8)
     model.train(gradient_steps=2, batch_size=8)

@@ -128,17 +128,13 @@ KINDS = {
 
 @pytest.mark.parametrize(("kind", "threads"), [*((kind, 1) for kind in KINDS), ("discrete", 2), ("guider's std, pulled", 2)])
 def test_every_kind_is_compiled_to_what_it_is(kind, threads):
-    """On one thread as one program; on two, branches are programs of their own, and run at once."""
+    """As one program, whose products have all threads, targets and all."""
     before = th.get_num_threads()
     th.set_num_threads(threads)
     try:
         plain, compiled = KINDS[kind](), KINDS[kind](compile=True)
         _train((plain, compiled))
-        names = {key[0] for key in compiled.programs}
-        branches = threads > 1 and isinstance(compiled, GAC)
-        of_branches = {("outputs", "guider"), ("outputs", "learner")}
-        of_branches |= {(f"{role}_critic", role) for role in ("guider", "learner")}
-        assert names == (of_branches if branches else {"update"})
+        assert [name for name, *_ in compiled.programs] == ["_update_with_targets"]
     finally:
         th.set_num_threads(before)
     _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
