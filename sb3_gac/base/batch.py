@@ -9,6 +9,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.math.losses import soft_target
 from sb3_gac.networks.actors import RolePolicy
+from sb3_gac.replay.episodes import SequenceSamples
 from sb3_gac.replay.histories import Histories
 
 #: Name -> detached scalar, left on the device
@@ -39,6 +40,31 @@ class Batch(NamedTuple):
     sequence: PyTorchObs | None = None
     mask: th.Tensor | None = None
     histories: Histories | None = None
+
+    @classmethod
+    def of(cls, samples: Any, gamma: float, histories: Histories | None = None) -> "Batch":
+        """
+        :param samples: of a replay buffer
+        :param gamma: discount factor, where they have none of their own
+        :param histories: see :class:`Batch`
+        """
+        discounts = getattr(samples, "discounts", None)
+        if discounts is None:
+            discounts = th.full((), gamma, device=samples.rewards.device)
+        if isinstance(samples, SequenceSamples):
+            now = {key: entry[:-1] for key, entry in samples.observations.items()}
+            later = {key: entry[1:] for key, entry in samples.observations.items()}
+            what_happened = (samples.actions, samples.rewards, later, samples.dones)
+            return cls(now, *what_happened, discounts, samples.observations, samples.mask)
+        return cls(
+            samples.observations,
+            samples.actions,
+            samples.rewards.flatten(),
+            samples.next_observations,
+            samples.dones.flatten(),
+            discounts.flatten() if discounts.dim() else discounts,
+            histories=histories,
+        )
 
     def outputs(self, policy: RolePolicy) -> "Outputs":
         """

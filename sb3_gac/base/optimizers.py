@@ -1,0 +1,85 @@
+"""Optimisers of networks by role: one for each, which trains what no other network holds before it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
+
+from sb3_gac.base.acting import ActingPolicy
+from sb3_gac.base.roles import MEMORY, resolve_lr_scales
+from sb3_gac.optim.trained import TrainedParameters
+
+
+class OptimizedPolicy(ActingPolicy):
+    """Acting policies whose networks are trained; a subclass builds the networks, and then the optimisers."""
+
+    constructor_options: dict[str, Any]
+
+    def unclipped(self, role: str) -> int:
+        """
+        :param role: a network
+        :return: how many of its last parameters have no say in the clipping of its gradient
+        """
+        return 0
+
+    def _build_optimizers(self, lr_schedule: Schedule) -> None:
+        """Each network's own, as the attribute that SB3's SAC has on actor and critic."""
+        optimizer_class, kwargs = self.optimizer_class, dict(self.optimizer_kwargs)
+        if optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
+            kwargs.setdefault("fused", True)
+        lr_scales = resolve_lr_scales(self.roles, self.constructor_options["lr_scales"])
+        self.trained: dict[str, TrainedParameters] = {}
+        there = [role for role in self.roles.all if getattr(self, role) is not None]
+        owners: dict[int, str] = {}
+        for role in sorted(there, key=lambda role: role not in self.roles.parts):  # of what several hold, the first one
+            for parameter in getattr(self, role).parameters():
+                owners.setdefault(id(parameter), role)
+        for role in there:
+            network = getattr(self, role)
+            own = [parameter for parameter in network.parameters() if owners[id(parameter)] == role]
+            group = {"params": own, "lr_scale": lr_scales[role]}
+            network.optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+            self.trained[role] = TrainedParameters(own, network.optimizer, self.unclipped(role), self._memory_of(role))
+            self.trained[role].scale_memory(lr_scales[MEMORY])
+
+    def _memory_of(self, role: str) -> list[nn.Parameter]:
+        """Parameters of what a network remembers with."""
+        memory = getattr(getattr(self, role), "memory", None)
+        return [] if memory is None else list(memory.parameters())
+
+    def refresh_parameters(self, compiled: bool | None = None) -> None:
+        """
+        To be called before training and before saving: parameters may have been frozen, see :class:`TrainedParameters`.
+
+        :param compiled: see :meth:`TrainedParameters.refresh`
+        """
+        for parameters in self.trained.values():
+            parameters.refresh(compiled)
+
+    @property
+    def optimizer_options(self) -> tuple[Any, ...]:
+        """What a step of the optimisers depends on, but for learning rates: frozen parameters and options."""
+        groups = [getattr(self, role).optimizer.param_groups[0] for role in self.trained]
+        return tuple(
+            value if not isinstance(value, list) else tuple(value)
+            for group in groups
+            for name, value in group.items()
+            if name not in ("params", "lr", "initial_lr", "lr_scale", "memory_lr_scale")
+        )
+
+    def freeze_as_saved(self) -> None:
+        """To be called when a file has given the optimisers their state."""
+        for parameters in self.trained.values():
+            parameters.freeze_as_saved()
+
+    def scale_learning_rates(self, lr_scales: Mapping[str, float] | None) -> None:
+        """
+        :param lr_scales: network -> multiple of the learning rate, in place of those that there were
+        """
+        self.constructor_options["lr_scales"] = lr_scales
+        scales = resolve_lr_scales(self.roles, lr_scales)
+        for role, trained in self.trained.items():
+            trained.optimizer.param_groups[0]["lr_scale"] = scales[role]
+            trained.scale_memory(scales[MEMORY])
