@@ -1,12 +1,12 @@
 """A replay buffer for dict observations that stores each observation once."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -15,11 +15,10 @@ from sb3_gac.replay.frame_stack import resolve_frame_stacks
 from sb3_gac.replay.histories import Histories, steps_before, unbroken
 from sb3_gac.replay.observation_ring import ObservationRing
 from sb3_gac.replay.observation_store import FinalObservations, ObservationLayout, Rows, check_fits_in_memory
+from sb3_gac.replay.shown import CUT, DONE, TIME_LIMIT, ShownByStep
 
-DONE, TIME_LIMIT, CUT = 1, 2, 4
 
-
-class CompactDictReplayBuffer(DictReplayBuffer):
+class CompactDictReplayBuffer(ShownByStep):
     """
     A ring of observations: the next observation of a step is the observation of the following one.
 
@@ -89,31 +88,7 @@ class CompactDictReplayBuffer(DictReplayBuffer):
             self._ring = ObservationRing(self.layout, self.n_rows, self.n_envs)
             self._ring.rows = rows
 
-    # --- what SB3's buffers show -------------------------------------------------------------------------------------
-
-    @property
-    def observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
-        """Entry -> shape (rows, n_envs, \\*entry shape); the row at ``pos`` is the newest next observation."""
-        return self._everywhere(self._gather)
-
-    @property
-    def next_observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
-        """Entry -> shape (rows, n_envs, \\*entry shape), put together for inspection."""
-        return self._everywhere(lambda rows, envs: self._next_rows(rows, envs, only_stored=True))
-
-    def _everywhere(self, gather: Callable[[np.ndarray, np.ndarray], Rows]) -> dict[str, np.ndarray]:
-        packed = gather(*np.divmod(np.arange(self.n_rows * self.n_envs), self.n_envs))
-        return self.layout.unpack({group: values.reshape(*self.endings.shape, -1) for group, values in packed.items()})
-
-    @property
-    def dones(self) -> np.ndarray:  # type: ignore[override]
-        """1 where an episode ended, for whatever reason, shape (rows, n_envs)."""
-        return (self.endings & DONE).astype(np.float32)
-
-    @property
-    def timeouts(self) -> np.ndarray:  # type: ignore[override]
-        """1 where it ended by its time limit, shape (rows, n_envs)."""
-        return (self.endings & TIME_LIMIT > 0).astype(np.float32)
+    # --- sizes ------------------------------------------------------------------------------------------------------
 
     def nbytes(self) -> int:
         """Bytes allocated."""

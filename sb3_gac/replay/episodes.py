@@ -7,7 +7,8 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_gac.replay.buffer import DONE, TIME_LIMIT, CompactDictReplayBuffer
+from sb3_gac.replay.buffer import CompactDictReplayBuffer
+from sb3_gac.replay.shown import DONE, TIME_LIMIT
 
 
 class SequenceSamples(NamedTuple):

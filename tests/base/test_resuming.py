@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_gac import GAC, RMA, AsymmetricMPO, AsymmetricSAC, CheckpointError
 from sb3_gac.envs import SensorNoise
-from sb3_gac.replay.buffer import CUT
+from sb3_gac.replay.shown import CUT
 from tests.envs.rendering import needs_rendering
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
 from tests.registry import algorithms, make

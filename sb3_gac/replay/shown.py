@@ -1,0 +1,45 @@
+"""What a replay buffer that stores each observation once shows of itself: arrays by step, as SB3's buffers have them."""
+
+from collections.abc import Callable
+
+import numpy as np
+from stable_baselines3.common.buffers import DictReplayBuffer
+
+from sb3_gac.replay.observation_store import ObservationLayout, Rows
+
+#: Of ``endings``: an episode ended; by its time limit; it was cut off, as by a reset from outside
+DONE, TIME_LIMIT, CUT = 1, 2, 4
+
+
+class ShownByStep(DictReplayBuffer):
+    """Arrays that are put together when somebody asks for them."""
+
+    n_rows: int
+    layout: ObservationLayout
+    endings: np.ndarray
+    _gather: Callable[[np.ndarray, np.ndarray], Rows]
+    _next_rows: Callable[..., Rows]
+
+    @property
+    def observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
+        """Entry -> shape (rows, n_envs, \\*entry shape); the row at ``pos`` is the newest next observation."""
+        return self._everywhere(self._gather)
+
+    @property
+    def next_observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
+        """Entry -> shape (rows, n_envs, \\*entry shape), put together for inspection."""
+        return self._everywhere(lambda rows, envs: self._next_rows(rows, envs, only_stored=True))
+
+    def _everywhere(self, gather: Callable[[np.ndarray, np.ndarray], Rows]) -> dict[str, np.ndarray]:
+        packed = gather(*np.divmod(np.arange(self.n_rows * self.n_envs), self.n_envs))
+        return self.layout.unpack({group: values.reshape(*self.endings.shape, -1) for group, values in packed.items()})
+
+    @property
+    def dones(self) -> np.ndarray:  # type: ignore[override]
+        """1 where an episode ended, for whatever reason, shape (rows, n_envs)."""
+        return (self.endings & DONE).astype(np.float32)
+
+    @property
+    def timeouts(self) -> np.ndarray:  # type: ignore[override]
+        """1 where it ended by its time limit, shape (rows, n_envs)."""
+        return (self.endings & TIME_LIMIT > 0).astype(np.float32)
