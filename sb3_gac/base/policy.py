@@ -24,11 +24,12 @@ from sb3_gac.base.roles import (
     role_space,
 )
 from sb3_gac.checks.entries import ObservationReader
-from sb3_gac.checks.values import check_integer
+from sb3_gac.checks.values import check_choice, check_integer
 from sb3_gac.networks.actors import Actor, RolePolicy
 from sb3_gac.networks.critics import CriticEnsemble, DiscreteCriticEnsemble
 from sb3_gac.networks.encoders import EntryExtractor, VectorExtractor
 from sb3_gac.networks.heads import LOG_STD_BOUNDS
+from sb3_gac.networks.layers import INITIALIZATIONS, lecun_uniform_
 from sb3_gac.networks.recurrent import RecurrentCore
 from sb3_gac.networks.tied import write_each_tensor_once
 from sb3_gac.networks.values import StateValue
@@ -65,6 +66,9 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         needed; by default that of the policy class
     :param rnn_hidden_size: of recurrent networks: size of the recurrent layer, which comes after ``net_arch``
     :param rnn_net_arch: of recurrent networks: hidden layer sizes after the recurrent layer
+    :param softplus_min_std: ``None``, or what is added to softplus of the network's output to give the standard deviation, in
+        place of its exp within ``log_std_bounds``; Brax has 0.001
+    :param initialization: "torch", or "lecun_uniform", Brax's: see :func:`sb3_gac.networks.layers.lecun_uniform_`
     """
 
     #: Default of the argument of that name
@@ -90,6 +94,8 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         rnn_type: str | Mapping[str, str] | None = None,
         rnn_hidden_size: int = 256,
         rnn_net_arch: Sequence[int] = (256,),
+        softplus_min_std: float | None = None,
+        initialization: str = "torch",
     ):
         super().__init__(
             observation_space,
@@ -103,6 +109,7 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         )
         check_integer("n_critics", n_critics, 1)
         check_integer("rnn_hidden_size", rnn_hidden_size, 1)
+        check_choice("initialization", initialization, INITIALIZATIONS)
         self.net_arch = list(DEFAULT_NET_ARCH) if net_arch is None else net_arch
         self.constructor_options: dict[str, Any] = {
             "net_arch": self.net_arch,
@@ -111,6 +118,8 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
             "lr_scales": lr_scales,
             "n_critics": n_critics,
             "log_std_bounds": log_std_bounds,
+            "softplus_min_std": softplus_min_std,
+            "initialization": initialization,
             "share_features_extractor": share_features_extractor,
             "rnn_type": rnn_type,
             "rnn_hidden_size": rnn_hidden_size,
@@ -167,7 +176,7 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         shared: BaseFeaturesExtractor | None = None
         self._check_sharing()
         for role in self.roles.policies:
-            policy = self.make_policy(role, **self._role_kwargs(role, shared), log_std_bounds=self._log_std_bounds)
+            policy = self.make_policy(role, **self._role_kwargs(role, shared), **self._std_options)
             setattr(self, role, policy)
             if role == self.roles.deployed and self.share_features_extractor:
                 shared = policy.features_extractor
@@ -184,6 +193,8 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         for role in self.roles.values:
             setattr(self, role, StateValue(**self._role_kwargs(role, shared)))
         self.tie_networks()
+        if self.constructor_options["initialization"] == "lecun_uniform":
+            lecun_uniform_(self)  # targets, too, which so stay as what they follow
         write_each_tensor_once(self)
         pairs = self.pairs.values()
         self._followed: list[th.Tensor] = [parameter for network, _ in pairs for parameter in network.parameters()]
@@ -196,8 +207,9 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         return self.constructor_options["activation_fn"]
 
     @property
-    def _log_std_bounds(self) -> tuple[float, float]:
-        return self.constructor_options["log_std_bounds"]
+    def _std_options(self) -> dict[str, Any]:
+        options = {name: self.constructor_options[name] for name in ("log_std_bounds", "softplus_min_std")}
+        return {name: value for name, value in options.items() if value is not None}
 
     def _set_target(self, role: str, target: BaseModel) -> None:
         target.load_state_dict(getattr(self, role).state_dict())

@@ -45,6 +45,7 @@ class RolePolicy(RoleModel, BoundedPolicy):
     :param rest_extractor: encoder of the entries that the deployed policy does not read, if
         ``features_extractor`` is the deployed policy's and this is another role
     :param log_std_bounds: smallest and largest log standard deviation before tanh
+    :param softplus_min_std: see :func:`sb3_gac.networks.heads.make_head`
     :param memory: of the entries, for sequences; ``features_dim`` is then its output size
     """
 
@@ -63,6 +64,7 @@ class RolePolicy(RoleModel, BoundedPolicy):
         rest_extractor: BaseFeaturesExtractor | None = None,
         log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
         memory: Memory | None = None,
+        softplus_min_std: float | None = None,
     ):
         super().__init__(
             observation_space,
@@ -78,9 +80,10 @@ class RolePolicy(RoleModel, BoundedPolicy):
         self.features_dim = features_dim
         self.activation_fn = activation_fn
         self.log_std_bounds = log_std_bounds
+        self.softplus_min_std = softplus_min_std
         self.latent_net = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
         latent_dim = net_arch[-1] if net_arch else features_dim
-        self.head = make_head(latent_dim, action_space, log_std_bounds)
+        self.head = make_head(latent_dim, action_space, log_std_bounds, softplus_min_std)
 
     def forward(self, obs: PyTorchObs) -> Distribution:
         """See :meth:`distribution`."""
@@ -149,6 +152,7 @@ class RolePolicy(RoleModel, BoundedPolicy):
             "activation_fn": self.activation_fn,
             "rest_extractor": self.rest_extractor,
             "log_std_bounds": self.log_std_bounds,
+            "softplus_min_std": self.softplus_min_std,
             "memory": self.memory,
         }
 

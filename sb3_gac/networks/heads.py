@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch as th
+import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
-from sb3_gac.checks.values import UnsupportedActionSpaceError, check_box_actions, check_range
+from sb3_gac.checks.values import UnsupportedActionSpaceError, check_box_actions, check_positive, check_range
 from sb3_gac.math.distributions import Categorical, TanhGaussian
 from sb3_gac.math.losses import log_std_loss
 from sb3_gac.networks.layers import Head
@@ -27,14 +28,22 @@ class GaussianHead(nn.Module):
     :param latent_dim: H
     :param action_space: of A dimensions
     :param log_std_bounds: smallest and largest log standard deviation before tanh
+    :param softplus_min_std: see :func:`make_head`
     """
 
-    def __init__(self, latent_dim: int, action_space: spaces.Box, log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS):
+    def __init__(
+        self,
+        latent_dim: int,
+        action_space: spaces.Box,
+        log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
+        softplus_min_std: float | None = None,
+    ):
         super().__init__()
         action_dim = spaces.flatdim(action_space)
         self.mean = Head(latent_dim, action_dim)
         self.log_std = Head(latent_dim, action_dim)
         self.log_std_bounds = log_std_bounds
+        self.softplus_min_std = softplus_min_std
 
     def forward(self, latent: th.Tensor, detach_std: bool = False) -> TanhGaussian:
         """
@@ -42,8 +51,10 @@ class GaussianHead(nn.Module):
         :param detach_std: whether the standard deviation's gradient stops at its own layer
         :return: shapes (\\*E, A)
         """
-        log_std = self.log_std(latent.detach() if detach_std else latent)
-        return TanhGaussian(self.mean(latent), log_std.clamp(*self.log_std_bounds))
+        output = self.log_std(latent.detach() if detach_std else latent)
+        if self.softplus_min_std is None:
+            return TanhGaussian(self.mean(latent), output.clamp(*self.log_std_bounds))
+        return TanhGaussian(self.mean(latent), (F.softplus(output) + self.softplus_min_std).log())
 
     def deployment_parameters(self) -> list[nn.Parameter]:
         """Those that serve at deployment only, if the standard deviation of training is the guider's."""
@@ -110,17 +121,32 @@ class CategoricalHead(nn.Module):
         self.logits.bias.mul_(factor)
 
 
-def make_head(latent_dim: int, action_space: spaces.Space, log_std_bounds: tuple[float, float]) -> nn.Module:
+def make_head(
+    latent_dim: int,
+    action_space: spaces.Space,
+    log_std_bounds: tuple[float, float],
+    softplus_min_std: float | None = None,
+) -> nn.Module:
     """
     :param latent_dim: H
     :param action_space: Box or Discrete
     :param log_std_bounds: for Box
+    :param softplus_min_std: for Box: the standard deviation is softplus(output) and so much more, as Brax has it with 0.001
+        (``NormalTanhDistribution``); ``None`` for exp(output), the output within ``log_std_bounds``
+    :raises ValueError: if one of the two is no such number, or both are given
     """
     if isinstance(action_space, spaces.Discrete):
         return CategoricalHead(latent_dim, action_space)
     assert isinstance(action_space, spaces.Box)
     check_range("log_std_bounds", log_std_bounds)
-    return GaussianHead(latent_dim, action_space, log_std_bounds)
+    if softplus_min_std is not None:
+        check_positive("softplus_min_std", softplus_min_std)
+        if tuple(log_std_bounds) != LOG_STD_BOUNDS:
+            raise ValueError(
+                f"softplus_min_std={softplus_min_std} takes the place of log_std_bounds, which are {log_std_bounds!r}: leave "
+                "one of the two out."
+            )
+    return GaussianHead(latent_dim, action_space, log_std_bounds, softplus_min_std)
 
 
 def check_action_space(algorithm: str, action_space: spaces.Space) -> None:

@@ -1,9 +1,12 @@
 """Layers of networks: last ones in float32, and those of an ensemble in one product."""
 
+import math
 from collections.abc import Callable
 
 import torch as th
 from torch import nn
+
+INITIALIZATIONS = ("torch", "lecun_uniform")
 
 
 def in_float32(layer: Callable[[th.Tensor], th.Tensor], x: th.Tensor) -> th.Tensor:
@@ -115,3 +118,18 @@ class EnsembleOutput(nn.Module):
         :return: shape (N, B)
         """
         return (x * self.weight).sum(dim=-1) + self.bias
+
+
+@th.no_grad()
+def lecun_uniform_(module: nn.Module) -> None:
+    """
+    Weights from U(-sqrt(3 / F), sqrt(3 / F)) of F inputs, whose variance is 1 / F, and biases of zero: the initialisation of
+    LeCun et al. (1998, Efficient BackProp), which Brax's networks have. It is torch's, drawn before, times sqrt(3), so that a
+    last layer that was made small stays so. What a network remembers with has torch's own.
+
+    :param module: whose linear layers and convolutions have torch's initialisation
+    """
+    for layer in module.modules():
+        if isinstance(layer, (nn.Linear, nn.Conv1d, nn.Conv2d, EnsembleLinear, EnsembleInput, EnsembleOutput)):
+            for name, parameter in layer.named_parameters(recurse=False):
+                parameter.mul_(0.0 if name == "bias" else math.sqrt(3))

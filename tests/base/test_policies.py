@@ -6,6 +6,8 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_gac import GAC, AsymmetricSAC, GACShare
+from sb3_gac.networks.heads import LOG_STD_BOUNDS, make_head
+from sb3_gac.networks.layers import INITIALIZATIONS
 from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice, optimizers_of, small_model, unlike_each_other
 from tests.registry import classes
 
@@ -71,6 +73,61 @@ def test_a_residual_guiders_correction_starts_near_zero(env, guider, starts_at_t
         assert head.log_std.weight.abs().max() > 0.5 * 16**-0.5
 
 
+def test_a_std_by_softplus_is_the_number_and_what_is_added():
+    """log(1 + e^x) + 0.001 at -20, 0 and 3, in double precision; and the KL of two such Gaussians, which tanh leaves alone."""
+    head = make_head(3, spaces.Box(-1, 1, (3,)), LOG_STD_BOUNDS, softplus_min_std=0.001).double()
+    with th.no_grad():
+        head.log_std.weight.copy_(th.eye(3))
+        head.log_std.bias.zero_()
+    outputs = th.tensor([[-20.0, 0.0, 3.0], [1.0, -4.0, 0.5]], dtype=th.float64)
+    found = head(outputs)
+    expected = [0.0010000020611536, 0.6941471805599453, 3.0495873515737420]
+    th.testing.assert_close(found.log_std[0].exp(), th.tensor(expected, dtype=th.float64), rtol=1e-12, atol=0)
+    one, other = (type(found)(mean, log_std) for mean, log_std in zip(found.mean, found.log_std, strict=True))
+    plain = [
+        th.distributions.Normal(each.mean, (1 + row.exp()).log() + 0.001)
+        for each, row in zip((one, other), outputs, strict=True)
+    ]
+    th.testing.assert_close(one.kl(other), th.distributions.kl_divergence(*plain).sum())
+    log_jacobian = (1 - other.mean.tanh().square()).log()
+    th.testing.assert_close(one.log_prob(other.mean), (plain[0].log_prob(other.mean) - log_jacobian).sum())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"softplus_min_std": 0.0}, "softplus_min_std must be"),
+        ({"softplus_min_std": 0.001, "log_std_bounds": (-3, 1)}, r"softplus_min_std=0.001 takes the place of log_std_bounds"),
+        ({"initialization": "orthogonal"}, r"initialization must be one of \['lecun_uniform', 'torch'\], got 'orthogonal'"),
+    ],
+)
+def test_options_of_networks_that_mean_nothing_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        small_model(policy_kwargs=options)
+
+
+@pytest.mark.parametrize("options", [{"cls": AsymmetricSAC}, {"guider": "residual"}, {"guider": "lagged"}, {"cls": GACShare}])
+def test_lecuns_initialisation_is_torchs_times_the_root_of_three_without_biases(options):
+    """Targets are what they follow, and a residual guider starts at the learner, as ever."""
+    sizes = {"net_arch": [16, 16]}
+    lecun = small_model(**options, policy_kwargs={**sizes, "initialization": "lecun_uniform"}).policy
+    of_torch = dict(small_model(**options, policy_kwargs=sizes).policy.named_parameters())
+    for name, parameter in lecun.named_parameters():
+        factor = 0.0 if name.endswith("bias") else 3**0.5
+        th.testing.assert_close(parameter, factor * of_torch[name], msg=lambda text, name=name: f"{name}: {text}")
+    for network, target in lecun.pairs.values():
+        assert _same(network, target)
+    hidden = lecun.deployed.latent_net[2].weight
+    assert (1 / 16) ** 0.5 < hidden.abs().max() <= (3 / 16) ** 0.5
+    assert hidden.var().item() == pytest.approx(1 / 16, rel=0.2), "one over the inputs"
+
+
+def test_lecuns_initialisation_reaches_an_encoder_that_is_shared_once():
+    policies = [small_model(Sampled(IMAGE), policy_kwargs={**CNN, "initialization": name}).policy for name in INITIALIZATIONS]
+    first = [next(p for name, p in policy.named_parameters() if "extractor" in name and p.dim() == 4) for policy in policies]
+    th.testing.assert_close(first[1], 3**0.5 * first[0])
+
+
 @pytest.mark.parametrize("cls", [GAC, AsymmetricSAC])
 def test_a_policy_that_is_saved_by_itself_is_the_same_again(cls, tmp_path):
     """With all that it was made with, whether a network shows it or not."""
@@ -78,6 +135,7 @@ def test_a_policy_that_is_saved_by_itself_is_the_same_again(cls, tmp_path):
         "net_arch": [8, 4],
         "activation_fn": th.nn.Tanh,
         "log_std_bounds": (-3.0, -2.0),
+        "initialization": "lecun_uniform",
         "n_critics": 3,
         "optimizer_class": th.optim.AdamW,
         "optimizer_kwargs": {"weight_decay": 0.25},
@@ -88,6 +146,7 @@ def test_a_policy_that_is_saved_by_itself_is_the_same_again(cls, tmp_path):
     again = type(policy).load(tmp_path / "policy")
     assert _same(policy, again)
     assert again.deployed.log_std_bounds == (-3.0, -2.0)
+    assert again.constructor_options["initialization"] == "lecun_uniform"
     assert (again.deployed.activation_fn, again.n_critics, again.normalize_images) == (th.nn.Tanh, 3, False)
     for optimizer in optimizers_of(again):
         assert type(optimizer) is th.optim.AdamW
@@ -99,6 +158,7 @@ def test_a_policy_that_is_saved_by_itself_is_the_same_again(cls, tmp_path):
     [
         (GAC, {"guider": "independent", "shared_std": "guider", "max_kl": 0.01, "kl_reduction": "sum"}),
         (GACShare, {"guider": "residual", "shared_std": "learner"}),
+        (GAC, {"policy_kwargs": {"net_arch": [8], "softplus_min_std": 0.2}}),
     ],
 )
 def test_a_policy_of_ones_own_options_that_is_saved_by_itself_is_the_same_again(cls, options, tmp_path):
