@@ -14,6 +14,7 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import COSIL, GAC, TGRL, AsymmetricMPO, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac.networks.heads import LOG_STD_BOUNDS
 from tests.helpers import gradient_step, noise_of_step, unlike_each_other
 from tests.plain.algorithm_1 import PlainGAC, PlainGACWithoutQ, PlainSAC, PlainTGRL
 from tests.plain.cosil import PlainCOSIL
@@ -62,6 +63,8 @@ SUM = {"kl_reduction": "sum", "target_kl": 0.4}
 CLIPPED = {"max_grad_norm": 0.5}
 N_STEPS = {"n_steps": 3}
 PARTS = {"replay_buffer_kwargs": {"sequence_length": 2, "burn_in": 2}}
+MASKED = {"replay_buffer_kwargs": {"mask_truncations": True}}
+SOFTPLUS = {"policy_kwargs": {"softplus_min_std": 0.05, "log_std_bounds": LOG_STD_BOUNDS}}
 PAIRS, FOUR = {"critic_groups": 2}, {"policy_kwargs": {"n_critics": 4}}
 MPO = {
     "n_actions": 3,
@@ -102,6 +105,13 @@ CASES = {
     "lagged, bounded": Case(GAC, {"guider": "lagged", "max_kl": 0.05}, {"pull": 0.5}, {"learner_kl_scale": 0.5}),
     "lagged, discrete": Case(GAC, {"guider": "lagged"}, {"pull": 1.0}, discrete=True),
     "n steps": Case(GAC, of_model=N_STEPS),
+    "softplus": Case(GAC, {}, {"softplus_min_std": 0.05}, SOFTPLUS),
+    "independent, softplus, truncations masked": Case(
+        GAC, INDEPENDENT, GUIDERS_STD | {"pull": 1.0, "softplus_min_std": 0.05}, SOFTPLUS | MASKED
+    ),
+    "SAC, truncations masked, n steps": Case(AsymmetricSAC, of_model=MASKED | N_STEPS),
+    "MPO, softplus, truncations masked": Case(AsymmetricMPO, MPO, {"softplus_min_std": 0.05}, SOFTPLUS | MASKED),
+    "GRU, SAC, truncations masked": Case(AsymmetricSAC, of_model=MASKED, cell="Gru"),
     "normalised": Case(GAC, normalised=True),
     "normalised, n steps": Case(GAC, of_model=N_STEPS, normalised=True),
     "bound of alpha": Case(GAC, {"kl_coef_bounds": (1.9, 2.05), "target_kl": 1e-3}),
@@ -224,8 +234,9 @@ def test_a_gradient_step_is_the_plain_one(name):
     model, envs = _model(case, settings, arguments)
     frozen = [frozen.policy.actor for frozen in model.frozen.values()]
     plain = PLAIN[case.cls](model.policy, settings, *frozen)
-    length = case.of_model.get("replay_buffer_kwargs", {}).get("sequence_length")
-    replay = PlainReplay(envs, model.get_vec_normalize_env(), case.of_model.get("n_steps", 1), settings.gamma, length)
+    options = case.of_model.get("replay_buffer_kwargs", {})
+    how = (options.get("sequence_length"), options.get("mask_truncations", False))
+    replay = PlainReplay(envs, model.get_vec_normalize_env(), case.of_model.get("n_steps", 1), settings.gamma, *how)
     if case.cls in (GACShare, GACWithoutQ):
         assert "learner_critic" not in plain.networks
     before = {key: th.cat([p.detach().flatten().clone() for p in one.parameters()]) for key, one in plain.networks.items()}

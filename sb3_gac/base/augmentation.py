@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_gac.math.images import random_shift
-from sb3_gac.replay.episodes import SequenceSamples
+from sb3_gac.replay.samples import SequenceSamples
 
 
 def shifted_entries(space: spaces.Dict, keys: Iterable[str], pixels: int) -> tuple[str, ...]:

@@ -9,8 +9,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.math.losses import soft_target
 from sb3_gac.networks.actors import RolePolicy
-from sb3_gac.replay.episodes import SequenceSamples
 from sb3_gac.replay.histories import Histories
+from sb3_gac.replay.samples import SequenceSamples
 
 #: Name -> detached scalar, left on the device
 Metrics = dict[str, th.Tensor]
@@ -29,6 +29,7 @@ class Batch(NamedTuple):
     :param sequence: of sequences, observations and the last next one together, (T + 1, B, ...) of each entry
     :param mask: of sequences, 1 for what counts, 0 for padding and for what only brings memories up, shape (T, B)
     :param histories: of transitions, what came before each, if the algorithm's ``history_length`` asks for it
+    :param critic_weights: 1 for what critics learn from, 0 for what they leave, shape (\*E); ``None`` if they learn from all
     """
 
     observations: PyTorchObs
@@ -40,6 +41,7 @@ class Batch(NamedTuple):
     sequence: PyTorchObs | None = None
     mask: th.Tensor | None = None
     histories: Histories | None = None
+    critic_weights: th.Tensor | None = None
 
     @classmethod
     def of(cls, samples: Any, gamma: float, histories: Histories | None = None) -> "Batch":
@@ -55,7 +57,9 @@ class Batch(NamedTuple):
             now = {key: entry[:-1] for key, entry in samples.observations.items()}
             later = {key: entry[1:] for key, entry in samples.observations.items()}
             what_happened = (samples.actions, samples.rewards, later, samples.dones)
-            return cls(now, *what_happened, discounts, samples.observations, samples.mask)
+            weights = samples.critic_weights
+            return cls(now, *what_happened, discounts, samples.observations, samples.mask, critic_weights=weights)
+        weights = getattr(samples, "critic_weights", None)
         return cls(
             samples.observations,
             samples.actions,
@@ -64,6 +68,7 @@ class Batch(NamedTuple):
             samples.dones.flatten(),
             discounts.flatten() if discounts.dim() else discounts,
             histories=histories,
+            critic_weights=None if weights is None else weights.flatten(),
         )
 
     def outputs(self, policy: RolePolicy) -> "Outputs":

@@ -23,7 +23,7 @@ from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.source import ReplaySource
 
 #: Options of our replay buffers that say how to sample, not what is stored
-SAMPLING_OPTIONS = ("n_steps", "gamma", "sequence_length", "burn_in")
+SAMPLING_OPTIONS = ("n_steps", "gamma", "sequence_length", "burn_in", "mask_truncations")
 
 
 class OtherNumberOfEnvironmentsError(AssertionError, ValueError):

@@ -154,7 +154,8 @@ class GradientSteps(Compilation):
         :return: squared Bellman residual, with the mean Q
         """
         q = getattr(self.policy, name)(batch.observations, batch.actions)
-        return Loss(critic_loss(q, target, batch.mask), {f"{name}_q": masked_mean(q.detach().mean(dim=0), batch.mask)})
+        loss = critic_loss(q, target, batch.mask, batch.critic_weights)
+        return Loss(loss, {f"{name}_q": masked_mean(q.detach().mean(dim=0), batch.mask)})
 
     def coefficient_values(self) -> Metrics:
         """To be logged: name -> value, the mean over dimensions where there are several."""

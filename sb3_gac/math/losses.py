@@ -89,15 +89,18 @@ def soft_target(
     return reward + discount * (1 - done) * next_value
 
 
-def critic_loss(q: th.Tensor, target: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
+def critic_loss(q: th.Tensor, target: th.Tensor, mask: th.Tensor | None = None, weights: th.Tensor | None = None) -> th.Tensor:
     """
     Squared Bellman residual of an ensemble (eqs. 12 and 15): half the mean square, summed over the critics.
 
     :param q: shape (N, \\*E)
     :param target: shape (\\*E), detached
     :param mask: shape (\\*E)
+    :param weights: of the squares, shape (\\*E): what has none counts in the mean, as nothing; ``None`` where all are 1
     :return: scalar
     """
+    if weights is not None:
+        return 0.5 * masked_mean((q - target).square().sum(dim=0) * weights, mask)
     if mask is None:
         return 0.5 * len(q) * F.mse_loss(q, target.expand_as(q))
     return 0.5 * masked_mean((q - target).square().sum(dim=0), mask)

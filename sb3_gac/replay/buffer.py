@@ -15,6 +15,7 @@ from sb3_gac.replay.frame_stack import resolve_frame_stacks
 from sb3_gac.replay.histories import Histories, steps_before, unbroken
 from sb3_gac.replay.observation_ring import ObservationRing
 from sb3_gac.replay.observation_store import FinalObservations, ObservationLayout, Rows, check_fits_in_memory
+from sb3_gac.replay.samples import WeightedSamples
 from sb3_gac.replay.shown import CUT, DONE, TIME_LIMIT, ShownByStep
 
 
@@ -39,11 +40,15 @@ class CompactDictReplayBuffer(ShownByStep):
     :param storage_dtype: "float16" to store floating-point entries at half precision
     :param frame_stacks: entry -> number of its frames, joined along its first axis, the oldest first, as
         :class:`sb3_gac.envs.History` and SB3's ``VecFrameStack`` join them: ``{"partial": 3}``
+    :param mask_truncations: whether critics learn nothing from a step that ended by its time limit, instead of bootstrapping
+        from the observation that it ended with, which Brax's SAC does not have (``sac/losses.py``: the error times 1 -
+        truncation, in a mean over all); policies learn from it
     :raises MemoryError: if the buffer can't fit into the memory that is available
     """
 
     #: Transitions that are not sampled any more, per environment, of all that were ever added
     _n_retired = 0
+    mask_truncations = False
 
     def __init__(
         self,
@@ -58,10 +63,14 @@ class CompactDictReplayBuffer(ShownByStep):
         gamma: float = 0.99,
         storage_dtype: str | None = None,
         frame_stacks: Mapping[str, int] | None = None,
+        mask_truncations: bool = False,
     ):
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
         if n_steps < 1:
             raise ValueError(f"n_steps must be at least 1, got {n_steps}.")
+        if mask_truncations and not handle_timeout_termination:
+            raise ValueError("mask_truncations=True needs handle_timeout_termination=True, or no truncation is known.")
+        self.mask_truncations = mask_truncations
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.optimize_memory_usage = optimize_memory_usage
         self.handle_timeout_termination = handle_timeout_termination
@@ -244,13 +253,13 @@ class CompactDictReplayBuffer(ShownByStep):
     ) -> DictReplayBufferSamples:
         return self._transitions(batch_inds, np.random.randint(self.n_envs, size=len(batch_inds)), env)
 
-    def _transitions(self, batch_inds: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> DictReplayBufferSamples:
+    def _transitions(self, batch_inds: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> Any:
         rewards, last, discounts = self._n_step_rewards(batch_inds, envs, env)
         endings = self.endings[last, envs]
         terminated = (endings & (DONE | TIME_LIMIT)) == DONE
         observations = self._gather(batch_inds, envs)
         following = self._next_rows(last, envs, before=observations if self.n_steps == 1 else None)
-        return DictReplayBufferSamples(
+        samples = DictReplayBufferSamples(
             observations=self._to_tensors(observations, env),
             actions=self.to_torch(self.actions[batch_inds, envs], copy=False),
             next_observations=self._to_tensors(following, env),
@@ -258,6 +267,13 @@ class CompactDictReplayBuffer(ShownByStep):
             rewards=self.to_torch(rewards[:, None], copy=False),
             discounts=None if discounts is None else self.to_torch(discounts[:, None], copy=False),
         )
+        weights = self._critic_weights(endings)
+        return samples if weights is None else WeightedSamples(*samples, weights)
+
+    def _critic_weights(self, endings: np.ndarray) -> th.Tensor | None:
+        """Of steps that ended in these ways, if ``mask_truncations`` asks for it."""
+        masked = self.mask_truncations
+        return self.to_torch((endings & TIME_LIMIT == 0).astype(np.float32), copy=False) if masked else None
 
     def _histories(self, steps: np.ndarray, envs: np.ndarray, length: int, env: VecNormalize | None) -> Histories:
         before = steps_before(steps, length)

@@ -1,32 +1,15 @@
 """Replay of whole episodes, or of parts of them, for policies that remember."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
+from sb3_gac.replay.samples import SequenceSamples
 from sb3_gac.replay.shown import DONE, TIME_LIMIT
-
-
-class SequenceSamples(NamedTuple):
-    """
-    B sequences of up to T transitions, padded with zeros at their ends.
-
-    :param observations: dict of entries, (T + 1, B, ...) of each: the last valid one is the last next observation
-    :param actions: shape (T, B, A)
-    :param rewards: shape (T, B)
-    :param dones: 1 where the episode terminated, shape (T, B)
-    :param mask: 1 for what counts, 0 for padding and for the steps before it that only bring memories up, shape (T, B)
-    """
-
-    observations: dict[str, th.Tensor]
-    actions: th.Tensor
-    rewards: th.Tensor
-    dones: th.Tensor
-    mask: th.Tensor
 
 
 class EpisodeIndex:
@@ -200,6 +183,7 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
             self.to_torch(rewards.astype(np.float32), copy=False),
             self.to_torch(terminated.astype(np.float32), copy=False),
             self.to_torch((valid & (time >= burn_in)).astype(np.float32), copy=False),
+            self._critic_weights(self.endings[rows, envs]),
         )
 
     def _with_final(self, entry: th.Tensor, final: th.Tensor, lengths: np.ndarray, shape: tuple[int, ...]) -> th.Tensor:

@@ -10,7 +10,7 @@ from sb3_gac import GAC, AsymmetricSAC, preset
 from sb3_gac.base.augmentation import shifted
 from sb3_gac.envs import History
 from sb3_gac.networks.encoders import EntryExtractor, VectorExtractor
-from sb3_gac.replay.episodes import SequenceSamples
+from sb3_gac.replay.samples import SequenceSamples
 from tests.helpers import Sampled, TwoViewBandit, small_model
 
 FRAME = spaces.Dict(partial=spaces.Box(0, 255, (2, 36, 36), np.uint8), privileged=spaces.Box(-1, 1, (4,), np.float32))

@@ -51,6 +51,21 @@ def test_critic_loss_sums_half_the_mean_squares(dtype):
     assert_close(losses.critic_loss(case["q"], case["target"]), 0.5 * sum(case["mse_mean_per_critic"].tolist()))
 
 
+@DTYPES
+def test_what_has_no_weight_counts_in_the_critics_mean_as_nothing(dtype):
+    """
+    Errors 0.5, 1, 1 and -0.5, 1, 3; of their squares 0.25 + 1 and 0.25 + 9 count: 10.5 / 3 / 2. Brax's loss, the mean over
+    critics as well, is half of it; masked, the last of three is padding: (0.25 + 0.25) / 2 / 2.
+    """
+    q, target = th.tensor([[1, 2, 3], [0, 2, 5]], dtype=dtype), th.tensor([0.5, 1, 2], dtype=dtype)
+    truncation = th.tensor([0, 1, 0], dtype=dtype)
+    loss = losses.critic_loss(q, target, None, 1 - truncation)
+    assert_close(loss, 1.75)
+    assert_close(loss, 2 * 0.5 * (((q - target) * (1 - truncation)) ** 2).mean())
+    assert_close(losses.critic_loss(q, target, th.tensor([1, 1, 0], dtype=dtype), 1 - truncation), 0.125)
+    assert_close(losses.critic_loss(q, target, None, th.ones(3, dtype=dtype)), losses.critic_loss(q, target))
+
+
 @pytest.mark.parametrize("index", range(3))
 @DTYPES
 def test_dual_gradient_and_direction_eq17(index, dtype):

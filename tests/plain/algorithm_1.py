@@ -102,6 +102,7 @@ class Settings:
     gamma: float
     tau: float
     log_std_bounds: tuple[float, float]
+    softplus_min_std: float | None = None
     ent_coef: str | float = 0.0
     target_entropy: float = 0.0
     target_kl: float = 0.0
@@ -182,7 +183,8 @@ class PlainAlgorithm:
         else:
             q = self.q(critics, batch)(batch.actions)
         targets = y if isinstance(y, list) else [y] * len(q)
-        loss = th.stack([0.5 * batch.mean((one - to).square()) for one, to in zip(q, targets, strict=True)]).sum()
+        errors = [batch.learned * (one - to).square() for one, to in zip(q, targets, strict=True)]
+        loss = th.stack([0.5 * batch.mean(error) for error in errors]).sum()
         self.logged[f"{name}_q"] = th.stack([batch.mean(one) for one in q]).mean()
         self.logged[f"{name}_loss"] = loss
         self.descend(name, loss)
@@ -204,7 +206,13 @@ class PlainAlgorithm:
         """A network's own."""
         if "logits" in outputs:
             return Choice(outputs["logits"])
-        return Gaussian(outputs["mean"], outputs["log_std"].clamp(*self.settings.log_std_bounds).exp())
+        return Gaussian(outputs["mean"], self.std(outputs["log_std"]))
+
+    def std(self, output: th.Tensor) -> th.Tensor:
+        """What a network's last layer says of it."""
+        if self.settings.softplus_min_std is None:
+            return output.clamp(*self.settings.log_std_bounds).exp()
+        return (1 + output.exp()).log() + self.settings.softplus_min_std
 
     def outputs(self, network: Network, batch: Batch) -> list[dict[str, th.Tensor]]:
         """Of a policy's network, at the observations and at the next ones."""
@@ -332,7 +340,7 @@ class PlainGAC(PlainAlgorithm):
             return 0.0, []
         hidden = learner.hidden(self.seen(learner, batch)[0]).detach()
         outputs = learner.heads["log_std"](hidden), guider_outputs["log_std"]
-        own, its = (output.clamp(*self.settings.log_std_bounds) for output in outputs)
+        own, its = (self.std(output).log() for output in outputs)
         return batch.mean((own - its.detach()).square().mean(dim=-1)) / 2, list(learner.heads["log_std"].parameters())
 
 

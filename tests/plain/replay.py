@@ -66,6 +66,7 @@ class Batch(NamedTuple):
     :param terminated: shape (\\*E)
     :param discounts: of what follows, shape (\\*E)
     :param counts: 1, or 0 for padding, shape (\\*E)
+    :param learned: by critics: 1, or 0 for the end by a time limit, if it is masked, shape (\\*E)
     """
 
     observations: dict[str, th.Tensor]
@@ -75,6 +76,7 @@ class Batch(NamedTuple):
     terminated: th.Tensor
     discounts: th.Tensor
     counts: th.Tensor
+    learned: th.Tensor
 
     def mean(self, values: th.Tensor) -> th.Tensor:
         """Of what counts."""
@@ -90,13 +92,20 @@ class PlainReplay:
     :param n_steps: rewards to sum up
     :param gamma: discount factor
     :param sequence_length: steps that count in a sequence, ``None`` for whole episodes
+    :param mask_truncations: whether critics do not learn from the end by a time limit
     """
 
     def __init__(
-        self, envs: list[Recorded], vec_normalize: Any, n_steps: int, gamma: float, sequence_length: int | None = None
+        self,
+        envs: list[Recorded],
+        vec_normalize: Any,
+        n_steps: int,
+        gamma: float,
+        sequence_length: int | None = None,
+        mask_truncations: bool = False,
     ):
         self.envs, self.vec_normalize, self.n_steps, self.gamma = envs, vec_normalize, n_steps, gamma
-        self.sequence_length = sequence_length
+        self.sequence_length, self.mask_truncations = sequence_length, mask_truncations
         self._places = [(env, t) for env in envs for t in range(len(env.steps))]
         self._seen = np.stack([_flat(self.normalised(env.steps[t].obs)) for env, t in self._places])
 
@@ -150,7 +159,11 @@ class PlainReplay:
             th.tensor([float(step.terminated) for step in lasts], dtype=th.float64),
             th.tensor(discounts, dtype=th.float64),
             th.ones(len(places), dtype=th.float64),
+            th.tensor([self._is_learned(step) for step in lasts], dtype=th.float64),
         )
+
+    def _is_learned(self, step: Step) -> float:
+        return float(not self.mask_truncations or step.terminated or not step.ended)
 
     def _of_sequences(self, places: list[tuple[Recorded, int]], burn_in: list[int]) -> Batch:
         """Side by side; what pads the short ones, their last step again and again, must not matter."""
@@ -174,6 +187,7 @@ class PlainReplay:
             th.tensor([[float(step.terminated) for step in one] for one in padded], dtype=th.float64).t(),
             th.full((length, len(places)), self.gamma, dtype=th.float64),
             th.tensor(counts, dtype=th.float64).t(),
+            th.tensor([[self._is_learned(step) for step in one] for one in padded], dtype=th.float64).t(),
         )
 
     def _scaled(self, action: Any) -> th.Tensor:
