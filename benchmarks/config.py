@@ -12,7 +12,7 @@ from typing import Any
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
-from benchmarks.environments import environment, make_envs, normalized
+from benchmarks.environments import environment, make_envs
 from benchmarks.external import Program
 from benchmarks.suite import RunSpec, needed_runs, read_definitions, with_needed
 from benchmarks.yaml_checks import check_is, check_keys, check_numbers
@@ -21,6 +21,7 @@ from sb3_gac.base.arguments import present_names
 from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.envs.suites import SUITES, is_batched, suite_of
 from sb3_gac.presets import instantiate, merge, read_preset
+from sb3_gac.training.environments import normalized
 
 POLICY = "MultiInputPolicy"
 _GIVEN_TO_POLICIES = {"observation_space", "action_space", "lr_schedule"}
@@ -49,12 +50,13 @@ def read_algorithm(name: str, definition: Mapping[str, Any] | None = None) -> tu
 def normalization(spec: RunSpec) -> dict[str, Any] | None:
     """
     :param spec: of a run
-    :return: keyword arguments of the ``VecNormalize`` around its environments, ``normalize`` in the algorithm's definition;
-        ``None`` if there is none
+    :return: keyword arguments of the ``VecNormalize`` around its environments, ``normalize`` in the algorithm's definition, or
+        what its preset has for it; ``None`` if there is none
     :raises ValueError: if they are no mapping
     """
     definition = read_definitions()[spec.algorithm] if spec.definition is None else spec.definition
-    given = definition.get("normalize")
+    kind, _ = read_algorithm(spec.algorithm, spec.definition)
+    given = definition.get("normalize", read_preset(spec.preset).normalization(kind))
     if given is not None:
         check_is(f"algorithm {spec.algorithm}, normalize", given, "a mapping, such as {clip_obs: 5.0}", Mapping)
     return given

@@ -1,9 +1,8 @@
 """The environment of a run: a registered task with its sensor noise, or any of gymnasium's, with arguments and wrappers."""
 
-from collections.abc import Mapping
 from typing import Any
 
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.suite import RunSpec
 from sb3_gac.envs import make_vec
@@ -46,12 +45,3 @@ def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:
     if spec.environment is None:
         return make_vec(env_id, n_envs, seed, **kwargs)
     return make_any_envs(env_id, kwargs, spec.environment["wrappers"], n_envs, seed)
-
-
-def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = True) -> VecEnv:
-    """
-    :param env: of a run
-    :param options: of ``VecNormalize``, which leaves rewards alone; ``None`` for no normalisation
-    :param training: whether it gathers statistics
-    """
-    return env if options is None else VecNormalize(env, **{"norm_reward": False, "training": training, **options})

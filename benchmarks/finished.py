@@ -12,7 +12,7 @@ import pandas as pd
 import yaml
 
 from benchmarks.config import in_present_names, read_algorithm, resolve, settings_in_present_names
-from benchmarks.suite import RunSpec, made_with
+from benchmarks.suite import UNSAID, RunSpec, made_with
 from benchmarks.tidy import NEEDED, NO_NOISE, read_tidy
 
 #: What tells a suite's runs apart
@@ -153,7 +153,7 @@ def _is_among(results: Mapping[str, Any], spec: RunSpec) -> bool:
     if name_of(spec) not in results["runs"]:
         return False
     kind, arguments = resolve(spec)
-    recorded = results["settings"], results.get("particulars", {}).get(kind_of(spec), {})
+    recorded = UNSAID | results["settings"], results.get("particulars", {}).get(kind_of(spec), {})
     now = settings_of(spec), particulars_of(spec)
     return in_present_names(kind, results["arguments"][kind_of(spec)]) == arguments and all(
         settings_in_present_names(kind, before) == settings_in_present_names(kind, after)

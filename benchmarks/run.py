@@ -24,16 +24,17 @@ from stable_baselines3.common.vec_env import VecNormalize
 import sb3_gac
 from benchmarks.checkpoint import TIMING, checkpoints_of, locked, read_seconds, write_atomically, write_timing
 from benchmarks.config import POLICY, in_present_names, normalization, resolve, settings_in_present_names
-from benchmarks.environments import EVAL_SEED, make_envs, normalized
+from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.external import Program
 from benchmarks.program import read_rows, rows_as_text
-from benchmarks.suite import RUNS, RunSpec, made_with, needed_runs, read_suite
+from benchmarks.suite import RUNS, UNSAID, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.base.recording import holds_every_step
 from sb3_gac.presets import instantiate
+from sb3_gac.training.environments import STATISTICS, normalized
 from sb3_gac.training.provenance import provenance
 
 CONFIGURATION, MODEL = "config.yaml", "model.zip"
-STATISTICS, RECORDING = "vecnormalize.pkl", "recording.npz"
+RECORDING = "recording.npz"
 
 
 def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
@@ -94,7 +95,7 @@ def _comparable(algorithm_class: type, configuration: dict[str, Any]) -> dict[st
     """With arguments by their present names."""
     arguments = in_present_names(algorithm_class, configuration.get("arguments") or {})
     run = settings_in_present_names(algorithm_class, configuration.get("run") or {})
-    return {**configuration, "run": run, "arguments": arguments}
+    return {**configuration, "run": UNSAID | run, "arguments": arguments}
 
 
 def _write_configuration(
@@ -155,7 +156,12 @@ def _train(
     eval_env = normalized(make_envs(spec, spec.eval_episodes), options, training=False)
     every = spec.eval_every // spec.envs
     evaluation = _evaluation_class(algorithm_class)(
-        eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=spec.eval_episodes, verbose=0
+        eval_env,
+        eval_seed=EVAL_SEED,
+        eval_freq=every,
+        n_eval_episodes=spec.eval_episodes,
+        deterministic=spec.eval_deterministic,
+        verbose=0,
     )
     checkpoints = checkpoints_of(algorithm_class, directory)
     arguments = {"policy": POLICY, **instantiate(configuration["arguments"]), **models, "seed": spec.seed}

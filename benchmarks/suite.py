@@ -17,11 +17,13 @@ HERE = Path(__file__).parent
 RUNS = HERE / "runs"
 HYPERPARAMS = HERE / "hyperparams"
 _COMMON = ("steps", "envs", "preset", "eval_every", "eval_episodes")
-_SUITE_KEYS = {*_COMMON, "overrides", "algorithms", "cells"}
+_SUITE_KEYS = {*_COMMON, "eval_deterministic", "overrides", "algorithms", "cells"}
 _SHARED_KEYS = {"algorithms", "seeds", "needs"}
 _TASK_KEYS = {"task", "noises", "history", *_SHARED_KEYS}
 _ENV_KEYS = {"env", "env_kwargs", "wrappers", "name", *_SHARED_KEYS}
 NAME = re.compile(r"\w[\w.+-]*")
+#: Settings that runs of earlier versions had without saying so
+UNSAID = {"eval_deterministic": True}
 _WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # other digits may be in quotes for a reason
 
 
@@ -45,6 +47,8 @@ class RunSpec:
     :param history: observations that ``partial`` holds, with the actions between them; ``None`` for the newest alone
     :param needs: argument of the algorithm -> ``algorithm``, ``steps``, ``definition`` and ``needs`` of the run whose model
         that argument is
+    :param eval_deterministic: whether evaluations take the policies' likeliest actions, and not samples; programs of their own
+        evaluate as they do
     """
 
     algorithm: str
@@ -61,6 +65,7 @@ class RunSpec:
     definition: dict[str, Any] | None = None
     needs: dict[str, dict[str, Any]] | None = None
     history: int | None = None
+    eval_deterministic: bool = True
 
     @property
     def title(self) -> str:
@@ -85,7 +90,7 @@ class RunSpec:
         directory = self.directory(root)
         if not (directory / "evaluations.csv").exists():
             return False
-        there = yaml.safe_load((directory / "config.yaml").read_text())["run"]
+        there = UNSAID | yaml.safe_load((directory / "config.yaml").read_text())["run"]
         changed = sorted(key for key, value in asdict(self).items() if there.get(key) != value)
         if changed:
             raise ValueError(f"{directory} holds a run with other settings under {changed}: remove it, or use another --runs.")
@@ -158,6 +163,8 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
     if not suite["envs"] <= suite["eval_every"] <= suite["steps"]:
         numbers = ", ".join(f"{key} {suite[key]}" for key in ("envs", "eval_every", "steps"))
         raise ValueError(f"{path.name}: eval_every must be from envs to steps, or no evaluation is made; there are {numbers}.")
+    if not isinstance(deterministic := suite.get("eval_deterministic", True), bool):
+        raise ValueError(f"{path.name}, eval_deterministic: must be true or false, got {deterministic!r}.")
     check_is(f"{path.name}, overrides", suite.get("overrides", {}), "a mapping", Mapping)
     check_is(f"{path.name}, cells", suite["cells"], "a list of at least one cell", list, len)
     cells = _Reader(path.name, suite).cells()
@@ -218,6 +225,7 @@ class _Reader:
         check_list(f"{where}, seeds", cell["seeds"], "whole numbers", int)
         check_list(f"{where}, algorithms", cell["algorithms"], "names", str)
         common = {key: self._suite[key] for key in _COMMON} | {"overrides": self._suite.get("overrides", {})}
+        common["eval_deterministic"] = self._suite.get("eval_deterministic", True)
         particulars = self._particulars(where, cell)
         for noise in noises:
             yield [

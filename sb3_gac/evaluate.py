@@ -51,10 +51,10 @@ from sb3_gac.evaluation.settings import (
     plan,
 )
 from sb3_gac.evaluation.video import check_can_film, film
+from sb3_gac.training.environments import STATISTICS
 from sb3_gac.training.provenance import provenance
 
 EVAL_SEED = 10_000
-STATISTICS = "vecnormalize.pkl"  # where rl_zoo3 and the benchmarks have them
 SIDE_BY_SIDE = 10  # environments: more save little, since they are stepped one after the other
 WIDTHS = (5, 5, 5, 7, 7, 6, 18, 5, 25, 7)  # of the table's columns, before its cells are known
 

@@ -4,12 +4,15 @@ import json
 import re
 import shlex
 import signal
+from functools import partial
 from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pytest
 import torch as th
 import yaml
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, GuiderLearnerEvalCallback
 from sb3_gac.train import main, parse_arguments
@@ -18,6 +21,7 @@ from sb3_gac.training.evaluation import PartialOnly
 from sb3_gac.training.job import Job, finish, prepare
 from sb3_gac.training.options import algorithm_arguments
 
+InvertedDoublePendulum = partial(gymnasium.make, "sb3_gac/InvertedDoublePendulum-v5", noise_std=0.1)
 QUICK = ["--task", "InvertedDoublePendulum", "--steps", "400", "--seed", "3", "--episodes", "2", "--envs", "2"]
 SMALL = {"learning_starts": 50, "batch_size": 8, "gradient_steps": 1, "policy_kwargs": {"net_arch": [8]}}
 
@@ -170,6 +174,21 @@ def test_a_run_that_is_stopped_says_how_to_go_on_and_ends_as_if_it_had_not_been(
     resumed, model = (GAC.load(path / "model") for path in (directory, undisturbed))
     for parameter, wanted in zip(resumed.policy.parameters(), model.policy.parameters(), strict=True):
         assert th.equal(parameter, wanted)
+
+
+def test_a_preset_that_normalises_observations_leaves_their_statistics(tmp_path, capsys):
+    """And the learner is evaluated on what it learned from."""
+    small = "{learning_starts: 50, batch_size: 8, gradient_steps: 1, policy_kwargs: {net_arch: [8]}}"
+    main([*QUICK, "--preset", "paper-brax", "--overrides", small, "--history", "1", "--runs", str(tmp_path)])
+    (directory,) = tmp_path.iterdir()
+    statistics = VecNormalize.load(str(directory / "vecnormalize.pkl"), DummyVecEnv([InvertedDoublePendulum] * 2))
+    assert statistics.obs_rms["partial"].count == pytest.approx(402, abs=0.1), "of training alone"
+    assert f"is to be normalised by {directory / 'vecnormalize.pkl'}" in capsys.readouterr().out
+    statistics.training = False
+    model = GAC.load(directory / "model")
+    assert model.trained_normalised
+    results = json.loads((directory / "results.json").read_text())
+    assert results["learner"] == pytest.approx(job.evaluate(PartialOnly(model), statistics, 2)[0], rel=1e-3)
 
 
 @pytest.mark.usefixtures("_quick")

@@ -74,9 +74,9 @@ def target_kls(number: int) -> str:
     rows = []
     for task, values in _CONTENT["target_kl"][number].items():
         for noise, value in zip(NOISES, values, strict=True):
-            ours = (preset(name, task=task, noise=noise).get("target_kl") for name in ("paper-brax", OURS))
+            ours = (preset(name, task=task, noise=noise).get("target_kl") for name in ("paper", OURS))
             rows.append([task, f"{noise:g}", f"{value:g}", *("0.0033 (default)" if kl is None else f"{kl:g}" for kl in ours)])
-    head = ["task", "noise", "paper", "preset paper-brax", f"preset {OURS}"]
+    head = ["task", "noise", "paper", "preset paper", f"preset {OURS}"]
     return f"Table {number}: target_kl by task and noise in Brax\n\n{in_columns(head, rows)}"
 
 

@@ -208,6 +208,11 @@ class AsymmetricAlgorithm(
             source = getattr(self, name)
             if source is not None:
                 self.frozen[name] = load_frozen_policy(source, self.observation_space, self.action_space, self.device, name)
+                if self.frozen[name].trained_normalised and self.get_vec_normalize_env() is None:
+                    raise ValueError(
+                        f"{name} learned from observations that VecNormalize normalised, and these are as they are: wrap env "
+                        "in VecNormalize.load(<its statistics>, env), or train it without."
+                    )
             elif needed:
                 raise ValueError(
                     f"{type(self).__name__} trains with a {name}: pass {name}=<a trained model or its path>, to load() and "

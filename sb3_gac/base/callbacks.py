@@ -1,11 +1,14 @@
 """Evaluation from the same seeds every time: of the deployed policy, and of guider and learner side by side."""
 
 import warnings
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
@@ -13,9 +16,20 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 _WATCHED = ("train/kl", "train/target_kl", "train/kl_coef", "train/kl_coef_on_bound")
 
 
+@contextmanager
+def _random_numbers_from(seed: int) -> Iterator[None]:
+    """torch's random numbers begin with a seed, and afterwards go on as if none had been drawn."""
+    with th.random.fork_rng():
+        th.manual_seed(seed)
+        yield
+
+
 class SeededEvalCallback(EvalCallback):
     """
     ``EvalCallback`` with the same initial states and sensor noise at every evaluation, and its results kept in ``history``.
+
+    With ``deterministic=False`` the actions are sampled, by random numbers that are the same at every evaluation as well, and
+    that training does not see.
 
     :param eval_env: environment for evaluation
     :param eval_seed: seed of the evaluation environments before every evaluation
@@ -31,14 +45,19 @@ class SeededEvalCallback(EvalCallback):
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
             return True
-        self._before_evaluation()
+        with self._random_numbers():
+            self._before_evaluation()
         self.eval_env.seed(self.eval_seed)
         self._episode_returns = []
-        go_on = super()._on_step()
+        with self._random_numbers():
+            go_on = super()._on_step()
         returns = np.array(self._episode_returns)
         self.history.append({"timesteps": self.num_timesteps, "learner": returns.mean()})
         self._after_evaluation(returns)
         return go_on
+
+    def _random_numbers(self) -> AbstractContextManager:
+        return nullcontext() if self.deterministic else _random_numbers_from(self.eval_seed)
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
         super()._log_success_callback(locals_, globals_)

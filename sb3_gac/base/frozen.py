@@ -37,6 +37,7 @@ class FrozenPolicy(nn.Module):
         if not (isinstance(model, SAC) or isinstance(getattr(model, "policy", None), AsymmetricPolicy)):
             raise TypeError(f"{name} must be a model of sb3_gac, or SB3's SAC on a Dict space, got {type(model).__name__}.")
         self.policy = deepcopy(model.policy)  # the model itself may train on
+        self.trained_normalised = bool(getattr(model, "trained_normalised", False))
         if isinstance(self.policy, AsymmetricPolicy) and (self.policy.remembers or any(self.policy.rnn_types.values())):
             raise ValueError(f"{name} has a memory, and it is asked about single transitions: train one without.")
         self.requires_grad_(False)

@@ -11,7 +11,8 @@ from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.networks.actors import DeployedPolicy
 
 TOLERANCE = 1e-5
-SHARE_OF_OUTLIERS = 0.1  # of what is drawn of normalised entries: many are clipped
+SHARE_OF_OUTLIERS = 0.1  # of what is drawn of normalised entries: many are clipped, where that is within
+FARTHEST = 100.0  # standard deviations
 STEPS = 8  # of the sequences that policies with a memory are compared on
 Entries = dict[str, np.ndarray]
 
@@ -67,7 +68,7 @@ def draw_observations(policy: DeployedPolicy, normalizer: DeploymentNormalizer |
         drawn = np.stack([np.asarray(space.sample()) for _ in range(n)])
         if np.issubdtype(drawn.dtype, np.floating):
             if normalizer is not None and key in normalizer.mean:
-                scale = np.where(rng.random(drawn.shape) < SHARE_OF_OUTLIERS, 2.0 * normalizer.clip_obs, 2.0)
+                scale = np.where(rng.random(drawn.shape) < SHARE_OF_OUTLIERS, 2.0 * min(normalizer.clip_obs, FARTHEST), 2.0)
                 drawn = normalizer.mean[key] + rng.normal(scale=scale) * np.sqrt(normalizer.var[key])
             elif not ((space.high - space.low) < 1e3).all():  # type: ignore[attr-defined]
                 drawn = np.clip(rng.normal(scale=2.0, size=drawn.shape), space.low, space.high)  # type: ignore[attr-defined]

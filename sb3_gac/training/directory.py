@@ -17,6 +17,7 @@ from sb3_gac.checks.arguments import KEPT_AS, constructor_arguments
 from sb3_gac.envs import PARTIAL
 from sb3_gac.envs.suites import SUITES, suite_of
 from sb3_gac.stopping import command
+from sb3_gac.training.environments import STATISTICS
 from sb3_gac.training.evaluation import EVAL_SEED
 from sb3_gac.training.options import DEFAULTS, name_of_run, resolve
 from sb3_gac.training.provenance import provenance
@@ -136,13 +137,20 @@ def summary(directory: Path, options: Namespace) -> str:
     results = json.loads((directory / RESULTS).read_text())
     name = algorithm_class(options.algorithm).__name__
     learner, random = (f"{shown(results[key])} +- {shown(results[f'{key}_std'])}" for key in ("learner", "random"))
+    statistics = directory / STATISTICS
+    normalised = (
+        f"""
+The observation is to be normalised by {statistics}, as in training; a file of `sb3-gac export --vec-normalize` does it."""
+        if statistics.exists()
+        else ""
+    )
     return f"""
 Trained {name} on {in_words(options)} for {results["steps"]:,} steps in {results["minutes"]:.1f} minutes.
 Learner, seeing `{PARTIAL}` alone: return {learner} over {options.episodes} episodes.
 Random actions, same seeds: {random}.
 Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:
     from sb3_gac import {name}; model = {name}.load("{directory / MODEL}")
-    action, _ = model.predict({{"{PARTIAL}": observation}}, deterministic=True)"""
+    action, _ = model.predict({{"{PARTIAL}": observation}}, deterministic=True){normalised}"""
 
 
 def in_words(options: Namespace) -> str:

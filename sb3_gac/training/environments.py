@@ -11,11 +11,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_gac.algorithms import import_path
 from sb3_gac.envs import PARTIAL, History, make_vec
 from sb3_gac.envs.suites import suite_of
+
+#: File of ``VecNormalize``'s statistics beside a model, as rl_zoo3 calls it
+STATISTICS = "vecnormalize.pkl"
 
 
 def make_envs(
@@ -79,6 +82,15 @@ def with_history(env: gym.Env, length: int) -> gym.Env:
     entry = env.observation_space[PARTIAL]
     is_vector = len(entry.shape or ()) == 1 and np.issubdtype(entry.dtype, np.floating)
     return History(env, length, actions=is_vector and isinstance(env.action_space, spaces.Box))
+
+
+def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = True) -> VecEnv:
+    """
+    :param env: vectorised environments
+    :param options: of ``VecNormalize``, which leaves rewards alone; ``None`` for no normalisation
+    :param training: whether it gathers statistics
+    """
+    return env if options is None else VecNormalize(env, **{"norm_reward": False, "training": training, **options})
 
 
 def find_modules_here() -> None:

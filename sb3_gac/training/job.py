@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 from gymnasium.error import Error as GymnasiumError
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_gac import ExactCheckpointCallback, GuiderLearnerEvalCallback, SeededEvalCallback
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.checkpoint.files import checkpoints
+from sb3_gac.presets import PRESETS
 from sb3_gac.stopping import when_stopped_say
 from sb3_gac.training.curve import draw_learning_curve
 from sb3_gac.training.directory import (
@@ -27,7 +28,7 @@ from sb3_gac.training.directory import (
     write_at_once,
     write_configuration,
 )
-from sb3_gac.training.environments import find_modules_here, make_envs
+from sb3_gac.training.environments import STATISTICS, find_modules_here, make_envs, normalized
 from sb3_gac.training.evaluation import EVAL_SEED, PartialOnly, UniformActions, evaluate
 from sb3_gac.training.options import algorithm_arguments
 from sb3_gac.training.progress import Progress
@@ -89,9 +90,10 @@ def open_environments(options: Namespace) -> tuple[VecEnv, VecEnv]:
     """
     find_modules_here()
     made = (options.env_id, options.env_kwargs, options.wrappers)
+    normalization = PRESETS[options.preset].normalization(options.algorithm)
     try:
-        env = make_envs(*made, options.envs, options.seed)
-        return env, make_envs(*made, min(5, options.episodes))
+        env = normalized(make_envs(*made, options.envs, options.seed), normalization)
+        return env, normalized(make_envs(*made, min(5, options.episodes)), normalization, training=False)
     except (ImportError, GymnasiumError, ValueError) as error:
         raise ValueError(f"{options.env_id}: {error}") from error
 
@@ -162,6 +164,10 @@ def finish(job: Job, history: list[dict[str, float]], minutes: float) -> None:
     """
     options, directory, model, eval_env = job
     model.save(directory / MODEL)
+    if isinstance(eval_env, VecNormalize):
+        of_training = model.get_vec_normalize_env()
+        of_training.save(str(directory / STATISTICS))
+        sync_envs_normalization(of_training, eval_env)
     learner, learner_std = evaluate(PartialOnly(model), eval_env, options.episodes)
     random, random_std = evaluate(UniformActions(eval_env), eval_env, options.episodes)
     warm_up = getattr(model, "learning_starts", 0)

@@ -120,6 +120,21 @@ def test_both_policies_start_from_the_same_observations_at_every_evaluation(n_en
     assert starts[0] != starts[-1] or n_envs == 1
 
 
+def test_sampled_actions_are_the_same_at_every_evaluation_and_training_does_not_see_them():
+    def trained(**options):
+        model = _model(_vec_env(), learning_rate=0.0, kl_coef=1.0, ent_coef=0.1)
+        callback = _callback(_vec_env(), **options)
+        return model.learn(30, callback=callback if options else None), callback.history
+
+    model, sampled = trained(deterministic=False)
+    _, likeliest = trained(deterministic=True)
+    for name in ("learner", "guider"):
+        assert len({row[name] for row in sampled}) == 1
+        assert sampled[0][name] != pytest.approx(likeliest[0][name])
+    alone, _ = trained()
+    np.testing.assert_array_equal(model.replay_buffer.actions, alone.replay_buffer.actions)
+
+
 def test_a_model_without_a_guider_is_named():
     model = AsymmetricSAC("MultiInputPolicy", Paid(), buffer_size=100, policy_kwargs={"net_arch": [4]}, device="cpu")
     with pytest.raises(TypeError, match="a guider, which AsymmetricSAC does not have: use SeededEvalCallback"):

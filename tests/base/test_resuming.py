@@ -18,9 +18,10 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_gac import GAC, RMA, AsymmetricMPO, AsymmetricSAC, CheckpointError
+from sb3_gac import GAC, PRESETS, RMA, AsymmetricMPO, AsymmetricSAC, CheckpointError
 from sb3_gac.envs import SensorNoise
 from sb3_gac.replay.shown import CUT
+from sb3_gac.training.environments import normalized
 from tests.envs.rendering import needs_rendering
 from tests.helpers import Recall, TwoViewBandit, TwoViewChoice, small_model
 from tests.registry import algorithms, make
@@ -57,6 +58,14 @@ GRU = {
 CASES = {  # name -> environment, algorithm and arguments
     "mujoco": (_hopper, GAC, {}),
     "normalised": (lambda: VecNormalize(_hopper()), GAC, {}),
+    "as Brax has it": (
+        lambda: normalized(_bandits(), PRESETS["paper-brax"].normalization()),
+        GAC,
+        {
+            "policy_kwargs": {"net_arch": [8], "softplus_min_std": 0.001, "initialization": "lecun_uniform"},
+            "replay_buffer_kwargs": {"mask_truncations": True},
+        },
+    ),
     "a full buffer": (_bandits, GAC, {"buffer_size": 50}),
     "n-step, half precision": (_hopper, GAC, {"n_steps": 3, "replay_buffer_kwargs": {"storage_dtype": "float16"}}),
     "a schedule": (

@@ -450,10 +450,10 @@ def test_arguments_are_layered():
     [("Ant", 0.0, 0.01), ("Ant", 0.3, 0.001), ("HalfCheetah", 0.2, 0.001), ("InvertedDoublePendulum", 0.1, 0.001)],
 )
 def test_the_papers_preset_has_the_papers_values(task, noise, target_kl):
-    _, arguments = resolve(RunSpec("gac-independent", task, noise, 0, 2_000_000, 128, "paper-brax", 1, 1))
+    _, arguments = resolve(RunSpec("gac-independent", task, noise, 0, 2_000_000, 128, "paper", 1, 1))
     assert arguments["target_kl"] == target_kl
     assert (arguments["batch_size"], arguments["gradient_steps"], arguments["buffer_size"]) == (512, 64, 1_000_000)
-    _, of_sac = resolve(RunSpec("sac-asym", task, noise, 0, 2_000_000, 128, "paper-brax", 1, 1))
+    _, of_sac = resolve(RunSpec("sac-asym", task, noise, 0, 2_000_000, 128, "paper", 1, 1))
     assert set(arguments) - set(of_sac) == {"guider", "learner_entropy", "target_kl"}
 
 
@@ -699,6 +699,39 @@ def test_a_finished_run_with_other_settings_is_neither_skipped_nor_counted(tmp_p
     for program in (lambda: run(spec, tmp_path), lambda: jobs_left(SMOKE, tmp_path), lambda: finished_runs(SMOKE, tmp_path)):
         with pytest.raises(ValueError, match=r"other settings under \['eval_episodes'\]: remove it, or use another --runs"):
             program()
+
+
+def test_a_run_from_before_it_could_say_how_it_is_evaluated_was_evaluated_by_its_likeliest_actions(tmp_path):
+    """Whether it is finished, has results, or goes on."""
+    spec = replace(read_suite(SMOKE)[0])
+    directory = spec.directory(tmp_path)
+    directory.mkdir(parents=True)
+    before = {key: value for key, value in asdict(spec).items() if key != "eval_deterministic"}
+    (directory / "config.yaml").write_text(yaml.safe_dump({"run": before, "arguments": resolve(spec)[1]}))
+    (directory / "evaluations.csv").write_text("done")
+    assert spec.is_finished(tmp_path)
+    with pytest.raises(ValueError, match=r"other settings under \['eval_deterministic'\]"):
+        replace(spec, eval_deterministic=False).is_finished(tmp_path)
+    (directory / "evaluations.csv").unlink()
+    with pytest.raises(ValueError, match=r"unfinished run with other settings under \['run'\]"):
+        run(replace(spec, eval_deterministic=False), tmp_path)
+    run(replace(spec), tmp_path)
+    assert yaml.safe_load((directory / "config.yaml").read_text())["run"]["eval_deterministic"] is True
+
+
+def test_a_run_may_be_evaluated_by_samples(tmp_path):
+    path = tmp_path / "sampled.yml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(SMOKE.read_text()) | {"eval_deterministic": False, "cells": [CELL]}))
+    spec = replace(read_suite(path)[0], task="InvertedDoublePendulum", algorithm="sac-asym", steps=200, eval_every=200)
+    likeliest, sampled = (
+        pd.read_csv(run(one, tmp_path / str(one.eval_deterministic)) / "evaluations.csv")
+        for one in (replace(spec, eval_deterministic=True), spec)
+    )
+    assert likeliest.timesteps.tolist() == sampled.timesteps.tolist() == [200]
+    assert likeliest.learner.tolist() != sampled.learner.tolist()
+    path.write_text(yaml.safe_dump(yaml.safe_load(SMOKE.read_text()) | {"eval_deterministic": 0}))
+    with pytest.raises(ValueError, match=r"sampled.yml, eval_deterministic: must be true or false, got 0"):
+        read_suite(path)
 
 
 def _results_of(suite, path, change):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from torch._dynamo.backends.debugging import aot_eager
 
 from sb3_gac import COSIL, GAC, RMA, AsymmetricMPO, AsymmetricSAC
@@ -122,6 +123,14 @@ KINDS = {
         **arguments,
     ),
     "MPO, discrete": lambda **arguments: _filled(AsymmetricMPO, env=TwoViewChoice(), **arguments),
+    "Brax's recipe": lambda **arguments: _filled(
+        GAC,
+        env=TimeLimit(TwoViewBandit(length=9), 3),
+        guider="independent",
+        policy_kwargs={"net_arch": [8], "softplus_min_std": 0.001, "initialization": "lecun_uniform"},
+        replay_buffer_kwargs={"mask_truncations": True},
+        **arguments,
+    ),
     "guider's std, pulled": lambda **arguments: _filled(GAC, shared_std="guider", learner_kl_scale=1.0, **arguments),
 }
 
