@@ -9,14 +9,14 @@ WORKERS ?= auto
 ARGS ?=
 
 BIN := $(VENV)/bin
-CODE := sb3_gac benchmarks tests examples
+CODE := sb3_gac benchmarks tests examples docs
 REUSED := $(if $(REUSE_RESULTS),--reuse-results $(REUSE_RESULTS))
 
 # What is given on the command line; all else has the program's own default
 TRAIN := $(foreach name,TASK NOISE STEPS SEED RUNS,$(if $($(name)),--$(shell echo $(name) | tr A-Z a-z) $($(name))))
 
 .DEFAULT_GOAL := help
-.PHONY: help train test mutants benchmark figure table format lint type clean
+.PHONY: help train test mutants benchmark figure table docs package format lint type clean
 
 help:  ## list what can be made, and the variables that it takes
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -38,6 +38,10 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	touch $@
 
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	touch $@
+
 train: $(VENV)/.installed  ## train GAC, evaluate the learner on partial alone, save everything in runs/
 	$(BIN)/python -m sb3_gac.train $(TRAIN) $(ARGS)
 
@@ -57,6 +61,12 @@ figure: $(VENV)/.installed-dev  ## a figure of the paper by number (N=1 to 12), 
 
 table: $(VENV)/.installed-dev  ## a table of the paper by number (N=2 to 8), and ours beside it
 	$(BIN)/python -m benchmarks.paper table $(N)
+
+docs: $(VENV)/.installed-docs  ## the documentation as a site, build/site/index.html
+	$(BIN)/mkdocs build --quiet --strict --site-dir build/site
+
+package: $(VENV)/.installed-dev  ## a wheel and an sdist in dist/, which pip installs anywhere
+	$(BIN)/python -m build --outdir dist .
 
 format: $(VENV)/.installed-dev  ## put the code in its form
 	$(BIN)/ruff check --fix $(CODE)

@@ -39,7 +39,7 @@ PROGRAMS = {
     "bench": Program("benchmarks", "the benchmarks, in a clone: launch, aggregate, report and others"),
 }
 #: Programs under ``benchmarks`` that users call
-BENCHMARKS = ("launch", "aggregate", "report", "headroom", "versus", "speed", "simulators", "theory", "soak")
+BENCHMARKS = ("launch", "aggregate", "report", "headroom", "versus", "speed", "simulators", "theory", "signs", "soak")
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The code of docs/environments.md, run as it stands there, but for shorter trainings."""
+"""The code of docs/environments.md and docs/goals.md, run as it stands there, but for shorter trainings."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ from sb3_gac import GAC
 from sb3_gac.envs.suites import SUITES
 from tests.envs.test_groups import Simulator
 
-PAGE = (Path(__file__).parents[1] / "docs/environments.md").read_text()
+PAGE = "".join((Path(__file__).parents[1] / f"docs/{name}.md").read_text() for name in ("environments", "goals"))
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
@@ -26,13 +26,13 @@ def test_what_a_user_types_runs(monkeypatch):
     shapes = []
     assert len(BLOCKS) == 6
     for number, block in enumerate(BLOCKS):
-        exec(compile(block.replace("5_000", "160"), f"environments.md, block {number}", "exec"), names)
+        exec(compile(block.replace("5_000", "160"), f"environments.md and goals.md, block {number}", "exec"), names)
         shapes.append({key: box.shape for key, box in names["env"].observation_space.items()})
     assert shapes[0] == {"partial": (4 * 6 + 3 * 2,), "privileged": (10,)}
     assert shapes[1] == {"partial": (9,), "privileged": (17,)}
-    assert shapes[2] == {"partial": (8,), "privileged": (5,)}
-    assert shapes[3] == {"partial": (5,), "privileged": (5,), "achieved_goal": (3,), "desired_goal": (3,)}
-    assert shapes[4] == {"partial": (2,), "privileged": (3,)}
+    assert shapes[2] == {"partial": (2,), "privileged": (3,)}
+    assert shapes[4] == {"partial": (8,), "privileged": (5,)}
+    assert shapes[5] == {"partial": (5,), "privileged": (5,), "achieved_goal": (3,), "desired_goal": (3,)}
     assert np.shape(names["action"]) == (4,)
     assert names["model"]._n_updates > 0
 

@@ -4,6 +4,7 @@ import configparser
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -57,18 +58,52 @@ def test_extras_bring_what_their_parts_need():
         assert set(modules) - {"optuna", "omegaconf"} <= names, "which come with rl_zoo3 and sheeprl"
 
 
-def test_an_editable_installation_is_a_path_that_type_checkers_follow(tmp_path):
-    """An import hook, the default, is followed by nothing but Python."""
+@pytest.fixture
+def checkout(tmp_path):
+    """A copy of what is built, in which building leaves its files."""
     pytest.importorskip("setuptools", minversion="77")
-    for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
+    for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "constraints.txt"):
         shutil.copy(ROOT / name, tmp_path)
-    shutil.copytree(ROOT / "sb3_gac", tmp_path / "sb3_gac", ignore=shutil.ignore_patterns("__pycache__"))
-    build = "from setuptools.build_meta import build_editable; print(build_editable('.'))"
-    subprocess.run([sys.executable, "-c", build], cwd=tmp_path, capture_output=True, check=True)
-    (wheel,) = tmp_path.glob("*.whl")
+    for name in ("sb3_gac", "benchmarks/page"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path
+
+
+def _build(checkout, kind):
+    """Without the isolation of ``python -m build``, which would ask a package index."""
+    build = f"from setuptools.build_meta import build_{kind} as build; print(build('.'))"
+    subprocess.run([sys.executable, "-c", build], cwd=checkout, capture_output=True, check=True)
+
+
+def test_a_wheel_has_the_package_whole_and_nothing_else(checkout):
+    _build(checkout, "wheel")
+    (wheel,) = checkout.glob("*.whl")
+    with zipfile.ZipFile(wheel) as contents:
+        names = {name for name in contents.namelist() if ".dist-info/" not in name}
+        (scripts,) = [contents.read(name).decode() for name in contents.namelist() if name.endswith("entry_points.txt")]
+    there = {str(path.relative_to(checkout)) for path in (checkout / "sb3_gac").rglob("*") if path.is_file()}
+    assert names == there
+    assert {"sb3_gac/py.typed", "sb3_gac/presets/small.yml", "sb3_gac/envs/suites/mujoco.py"} <= names
+    assert "sb3-gac = sb3_gac.__main__:main" in scripts
+
+
+def test_an_sdist_has_what_a_wheel_is_built_of(checkout):
+    _build(checkout, "sdist")
+    (sdist,) = checkout.glob("*.tar.gz")
+    with tarfile.open(sdist) as contents:
+        names = {name.partition("/")[2] for name in contents.getnames()}
+    there = {str(path.relative_to(checkout)) for path in (checkout / "sb3_gac").rglob("*") if path.is_file()}
+    assert there <= names
+    assert {"setup.cfg", "pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "constraints.txt"} <= names
+
+
+def test_an_editable_installation_is_a_path_that_type_checkers_follow(checkout):
+    """An import hook, the default, is followed by nothing but Python."""
+    _build(checkout, "editable")
+    (wheel,) = checkout.glob("*.whl")
     with zipfile.ZipFile(wheel) as contents:
         (pth,) = [name for name in contents.namelist() if name.endswith(".pth")]
-        assert contents.read(pth).decode().split() == [str(tmp_path)]
+        assert contents.read(pth).decode().split() == [str(checkout)]
 
 
 def test_every_file_of_arguments_in_the_package_is_shipped():

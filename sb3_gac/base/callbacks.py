@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-_WATCHED = ("train/kl", "train/target_kl", "train/kl_coef", "train/kl_coef_on_bound")
+_WATCHED = ("train/kl", "train/target_kl", "train/kl_coef", "train/kl_coef_on_bound", "train/learner_mean_abs")
 
 
 @contextmanager
@@ -85,9 +85,11 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
     """
     Evaluate the learner, as ``EvalCallback`` does, and the guider on the same seeds (the paper's Figure 4).
 
-    Logs ``eval/mean_reward`` (learner) and ``eval/guider_mean_reward``, and keeps both, with the means of KL and its
-    coefficient since the last evaluation, in ``history`` and in ``guider_evaluations.npz`` under ``log_path``.  Warns
-    when the learner no longer follows the guider, that is, when ``patience`` evaluations in a row find KL more than
+    Logs ``eval/mean_reward`` (learner) and ``eval/guider_mean_reward``, and keeps both in ``history`` and in
+    ``guider_evaluations.npz`` under ``log_path``, with the means since the last evaluation of KL, its coefficient and
+    ``learner_mean_abs`` (the size of the learner's mean action before tanh, where actions are continuous).
+
+    Warns when the learner no longer follows the guider, that is, when ``patience`` evaluations in a row find KL more than
     twice its target, the KL coefficient on a bound, or a guider that is clearly better.
 
     :param eval_env: environment for evaluation

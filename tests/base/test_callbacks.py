@@ -184,7 +184,7 @@ def test_saves_both_evaluations_and_the_best_model(tmp_path):
     assert saved["learner"] == pytest.approx(of_sb3["results"].mean(axis=1))
     assert of_sb3["results"].shape == (3, 4)
     assert np.isfinite(saved["guider"]).all()
-    for name in ("kl", "target_kl", "kl_coef", "kl_coef_on_bound"):
+    for name in ("kl", "target_kl", "kl_coef", "kl_coef_on_bound", "learner_mean_abs"):
         assert np.isnan(saved[name]).tolist() == [True, False, False]  # no gradient step before the first evaluation
     assert saved["target_kl"][1:] == pytest.approx(0.0033)
     assert callback.best_mean_reward == saved["learner"].max()
