@@ -1,4 +1,4 @@
-"""What MkDocs does not do by itself for this documentation: links out of docs/, the changelog, and the markup of docstrings."""
+"""What MkDocs does not do by itself for these pages: links out of docs/, the changelog, the markup of docstrings."""
 
 import posixpath
 import re

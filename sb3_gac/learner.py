@@ -34,7 +34,7 @@ class OnnxPolicy:
     """
     A policy that was written by :func:`sb3_gac.deploy.export.export_learner`; it acts deterministically.
 
-    :param session: of onnxruntime
+    :param session: onnxruntime's session of the file
     """
 
     def __init__(self, session: onnxruntime.InferenceSession):
@@ -50,7 +50,7 @@ class OnnxPolicy:
     @classmethod
     def load(cls, path: str | Path) -> "OnnxPolicy":
         """
-        :param path: of a file that :func:`sb3_gac.deploy.export.export_learner` wrote
+        :param path: file that :func:`sb3_gac.deploy.export.export_learner` wrote
         :raises FileNotFoundError: if there is none
         :raises ValueError: if it is another file, such as one for TorchScript, or a saved model
         """

@@ -33,7 +33,7 @@ class SeededEvalCallback(EvalCallback):
 
     :param eval_env: environment for evaluation
     :param eval_seed: seed of the evaluation environments before every evaluation
-    :param kwargs: of ``EvalCallback``
+    :param kwargs: further arguments of SB3's ``EvalCallback``, such as ``eval_freq`` and ``n_eval_episodes``
     """
 
     def __init__(self, eval_env: gym.Env | VecEnv, eval_seed: int = 10_000, **kwargs: Any):
@@ -97,7 +97,7 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
     :param patience: evaluations in a row before a warning
     :param gap_tolerance: how much of the guider's mean return the learner may lack, beyond two standard errors
     :param log_path: directory for results, ``None`` for none
-    :param kwargs: of ``EvalCallback``
+    :param kwargs: further arguments of SB3's ``EvalCallback``, such as ``eval_freq`` and ``n_eval_episodes``
     :raises TypeError: at the start of training, if the model has no guider
     """
 

@@ -28,7 +28,7 @@ class ExactCheckpointCallback(BaseCallback):
     the compiler's processes as well. A checkpoint that can't be written, on a full disk for example, is a warning:
     training goes on, and the checkpoint before stays.
 
-    :param directory: of the checkpoints
+    :param directory: folder in which the checkpoints are written
     :param every: environment steps between two of them
     :param keep: how many of the latest ones stay
     :param notes: called for each one, makes what is to be kept with it, see ``save_checkpoint``

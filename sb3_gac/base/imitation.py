@@ -57,7 +57,7 @@ def demonstrate(
 ) -> Demonstrations:
     """
     :param teacher: a trained model of this package or of SB3; of GAC and its like it is the guider that shows
-    :param env: to act in, from a reset on; it gives all entries that the teacher reads
+    :param env: environment to act in, from a reset on; it gives all entries that the teacher reads
     :param n_steps: environment steps of all environments together, rounded up
     :param student: who acts, while the teacher only says what it would have done (DAgger); by default the teacher acts
     :param deterministic: whether the teacher shows its most likely action, instead of a sample
@@ -97,12 +97,12 @@ def clone_behaviour(
     Critics know nothing of the cloned policy at first. Its first gradient steps in ``learn`` may unlearn it: give critics time
     by ``learning_starts`` and, where it can be, ``policy_delay``.
 
-    :param model: of this package, without a memory
-    :param demonstrations: to learn from, see :func:`demonstrate`
-    :param gradient_steps: of Adam
-    :param batch_size: of each of them
-    :param learning_rate: of Adam
-    :param seed: of what is held out, and of the batches
+    :param model: a model of this package, without a memory
+    :param demonstrations: what is learned from, see :func:`demonstrate`
+    :param gradient_steps: number of Adam's steps
+    :param batch_size: rows of the demonstrations in each step
+    :param learning_rate: Adam's step size
+    :param seed: number that decides what is held out, and the batches
     :return: "before" and "after": the mean squared error of actions in [-1, 1], or the share of other choices, on what was
         held out
     :raises TypeError: if the model is of another kind
@@ -139,7 +139,7 @@ def copy_networks(model: BaseAlgorithm, source: BaseAlgorithm, networks: Mapping
     """
     Start from what another model has learned: its networks' parameters in place of a model's own, targets included.
 
-    :param model: of this package
+    :param model: a model of this package
     :param source: likewise, with networks of the same sizes on the same entries
     :param networks: network of ``model`` -> network of ``source``, such as ``{"guider": "actor"}``
     :raises ValueError: if there is no such network, or its parameters are of other shapes

@@ -50,7 +50,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing):
 
     :param policy: "MultiInputPolicy", or a subclass of the policy class of that name
     :param env: environment with Dict observations and Box actions
-    :param learning_rate: of policies, critics and the entropy temperature; a number or a schedule
+    :param learning_rate: step size for policies, critics and the entropy temperature; a number or a schedule
     :param buffer_size: transitions kept
     :param learning_starts: steps of uniform warm-up
     :param batch_size: transitions per gradient step
@@ -61,11 +61,12 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing):
     :param action_noise: added to the behaviour policy's actions
     :param replay_buffer_class: default :class:`CompactDictReplayBuffer`, which stores each observation once
     :param replay_buffer_kwargs: keyword arguments for it
-    :param optimize_memory_usage: of other replay buffers, see SB3
+    :param optimize_memory_usage: argument of replay buffers of other classes, see SB3
     :param n_steps: rewards summed up in a critic's target before it bootstraps
     :param ent_coef: entropy temperature: "auto", "auto_<start value>" or a number
     :param target_update_interval: gradient steps between two updates of the targets
-    :param target_entropy: in nats: "auto", "sac" or a number, see :func:`sb3_gac.networks.heads.resolve_target_entropy`
+    :param target_entropy: entropy that the temperature aims at, in nats: "auto", "sac" or a number, see
+        :func:`sb3_gac.networks.heads.resolve_target_entropy`
     :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
     :param policy_delay: gradient steps to each step of a policy; critics take all
     :param update_every: network -> gradient steps to each step of its own, "critic" standing for all critics
@@ -90,7 +91,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing):
     :param tensorboard_log: log directory, ``None`` for no log
     :param policy_kwargs: keyword arguments of the policy class
     :param verbose: 0 silent, 1 information, 2 debug
-    :param seed: of the pseudo-random generators
+    :param seed: number from which all pseudo-random generators start; ``None`` for another one each time
     :param device: "auto", "cpu", "cuda", ...
     :param _init_setup_model: build the networks at construction
     """

@@ -39,7 +39,7 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
     :param gamma: discount factor
     :param gae_lambda: trade-off of bias and variance in advantages
     :param clip_range: how far a ratio of probabilities may count, epsilon; a number or a schedule
-    :param normalize_advantage: in each minibatch
+    :param normalize_advantage: whether advantages are normalised in each minibatch
     :param ent_coef: weight of the entropy
     :param vf_coef: weight of the value's loss
     :param max_grad_norm: bound on the norm of the gradient of all networks together; ``None`` for none
@@ -54,7 +54,7 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
     :param tensorboard_log: log directory, ``None`` for no log
     :param policy_kwargs: keyword arguments of the policy class
     :param verbose: 0 silent, 1 information, 2 debug
-    :param seed: of the pseudo-random generators
+    :param seed: number from which all pseudo-random generators start; ``None`` for another one each time
     :param device: "auto", "cpu", "cuda", ...
     :param _init_setup_model: build the networks at construction
     """

@@ -64,8 +64,8 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
     :param rnn_type: "gru" or "lstm" for networks that remember, and then take sequences; or role -> one of them, "critic"
         standing for all critics and "partial" for every network that reads ``partial`` alone, for a memory where it is
         needed; by default that of the policy class
-    :param rnn_hidden_size: of recurrent networks: size of the recurrent layer, which comes after ``net_arch``
-    :param rnn_net_arch: of recurrent networks: hidden layer sizes after the recurrent layer
+    :param rnn_hidden_size: size of the recurrent layer, which comes after ``net_arch``
+    :param rnn_net_arch: hidden layer sizes after the recurrent layer
     :param softplus_min_std: ``None``, or what is added to softplus of the network's output to give the standard deviation, in
         place of its exp within ``log_std_bounds``; Brax has 0.001
     :param initialization: "torch", or "lecun_uniform", Brax's: see :func:`sb3_gac.networks.layers.lecun_uniform_`

@@ -22,7 +22,7 @@ def write_recording(model: OffPolicyAlgorithm, path: str | PathLike) -> None:
     Write down all actions that a model's data were collected with, and the rewards, for the argument ``recording``.
 
     :param model: trained, with a replay buffer that still holds its first step
-    :param path: of the file, ``.npz``
+    :param path: file to write, ``.npz``
     :raises ValueError: if its first steps are no longer there, or the buffer is of another class than this package's
     """
     buffer = model.replay_buffer

@@ -93,9 +93,9 @@ class ResumableAlgorithm(BaseAlgorithm):
         To be called between two rounds of training: after ``learn``, or by a callback when a rollout starts, as
         :class:`sb3_gac.ExactCheckpointCallback` does. Of the replay buffer only what has changed is written.
 
-        :param directory: of all checkpoints of this run
+        :param directory: folder with all checkpoints of this run
         :param keep: how many of the latest ones stay
-        :param notes: of the caller's, anything that JSON can hold, see :attr:`resumed_notes`
+        :param notes: what the caller wants kept with it, anything that JSON can hold, see :attr:`resumed_notes`
         :return: directory of this checkpoint
         :raises OSError: if it can't be written; the checkpoints before it are as they were
         :raises TypeError: if the data are held in what can't be written down, as a replay buffer of another class than this
@@ -173,7 +173,7 @@ class ResumableAlgorithm(BaseAlgorithm):
         the bit where the environments can be put back to where they were; where they can't, a warning says why, and new
         episodes start.
 
-        :param directory: of :meth:`save_checkpoint`
+        :param directory: folder that :meth:`save_checkpoint` was given
         :param env: made like the one before
         :param device: may be another one
         :param given: arguments of the constructor, which take the place of those before, and ``strict_deployment``; needed

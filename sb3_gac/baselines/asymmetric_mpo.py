@@ -82,7 +82,7 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
     :param target_kl: bound on it, in each action dimension
     :param std_kl_coef: weight of that KL of the stds; "auto" starts at 1000
     :param target_std_kl: bound on it, in each action dimension
-    :param dual_learning_rate: of the temperature and the weights
+    :param dual_learning_rate: Adam's step size for the temperature and the weights
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

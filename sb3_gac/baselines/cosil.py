@@ -69,7 +69,7 @@ class COSIL(AsymmetricOffPolicyAlgorithm):
         :func:`sb3_gac.networks.heads.resolve_target_divergence`
     :param teacher_coef: weight of D: "auto" (learned: it rises while D is above its target), "auto_<start value>" or a number
     :param teacher_coef_bounds: smallest and largest value of a learned ``teacher_coef``
-    :param teacher_coef_learning_rate: of a learned ``teacher_coef``
+    :param teacher_coef_learning_rate: Adam's step size for a learned ``teacher_coef``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

@@ -117,8 +117,8 @@ def export_learner(
     for its use.
 
     :param model: trained
-    :param path: with the suffix ".onnx", or ".pt" for TorchScript; folders that are not there are made
-    :param normalizer: of the observations; by default that of the model's ``VecNormalize``, if it has one
+    :param path: file to write, with the suffix ".onnx", or ".pt" for TorchScript; folders that are not there are made
+    :param normalizer: what normalises the observations; by default that of the model's ``VecNormalize``, if it has one
     :param units: entry, or "action" -> unit, kept in the file's metadata
     :param verify_on: number of observations to compare the file's actions and those of ``predict`` on, see
         :func:`sb3_gac.deploy.verification.check_agreement`

@@ -17,8 +17,8 @@ class DeploymentNormalizer:
 
     :param mean: entry -> mean
     :param var: entry -> variance
-    :param epsilon: of ``VecNormalize``
-    :param clip_obs: of ``VecNormalize``
+    :param epsilon: what ``VecNormalize`` adds to a variance
+    :param clip_obs: bound on normalised values, as in ``VecNormalize``
     """
 
     def __init__(self, mean: Mapping[str, np.ndarray], var: Mapping[str, np.ndarray], epsilon: float, clip_obs: float):

@@ -13,7 +13,7 @@ class FlattenMultiDiscrete(gym.ActionWrapper):
     """
     Number the combinations of a MultiDiscrete action, the last component counting fastest.
 
-    :param env: with MultiDiscrete actions
+    :param env: environment with MultiDiscrete actions
     :raises ValueError: if its actions are of another kind
     """
 

@@ -29,7 +29,7 @@ class CameraImage(EntryWrapper):
     Shadows, reflections and smooth edges are left out, which makes drawing in software tens of times faster; the environment's
     own ``render`` has them as before. Drawing begins with the first reset.
 
-    :param env: of gymnasium's MuJoCo, with a Dict observation
+    :param env: one of gymnasium's MuJoCo environments, with a Dict observation
     :param size: pixels of each side
     :param camera: its name in the model
     :param key: the entry

@@ -31,7 +31,7 @@ class SensorDelay(EntryWrapper):
 
     In an episode's first steps, the first value stands in for those that are not there yet.
 
-    :param env: with a Dict observation
+    :param env: environment with a Dict observation
     :param steps: number of steps by which the entry is late, 0 for none
     :param key: the entry that is late; all others stay as they are
     :raises ValueError: if ``steps`` is no integer of at least 0, or the entry is missing
@@ -61,7 +61,7 @@ class DroppedFrames(EntryWrapper):
     environment's random numbers and those of the noise are the same whatever ``probability`` is, and what is lost with a
     small probability is lost with a larger one as well.
 
-    :param env: with a Dict observation
+    :param env: environment with a Dict observation
     :param probability: that a value is lost, from 0 to 1
     :param key: the entry whose values are lost; all others stay as they are
     :raises ValueError: if ``probability`` is no number from 0 to 1, or the entry is missing

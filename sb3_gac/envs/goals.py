@@ -18,7 +18,7 @@ class AppendDesiredGoal(gym.Wrapper):
     Append ``desired_goal`` to other entries, and drop both goals' own entries: the goal is a command that a policy reads with
     what it measures.  SB3's ``HerReplayBuffer`` needs those entries as they are: leave this wrapper out for it.
 
-    :param env: with a Dict observation that has ``desired_goal``, see ``keep`` of
+    :param env: environment with a Dict observation that has ``desired_goal``, see ``keep`` of
         :class:`~sb3_gac.envs.wrappers.SplitDictObservation`
     :param to: keys of the entries that get the goal, one-dimensional float32
     :raises ValueError: if ``to`` is no list of keys, or there is no such entry

@@ -47,7 +47,7 @@ class SplitObservation(_SplitWrapper):
     """
     Split a flat Box observation by indices.
 
-    :param env: with a one-dimensional Box observation
+    :param env: environment with a one-dimensional Box observation
     :param partial: indices of what the deployed policy will see
     :param privileged: indices of what only training sees; they may repeat those of ``partial``, where a clean copy
         of what becomes noisy is wanted
@@ -80,10 +80,10 @@ class SplitDictObservation(_SplitWrapper):
     """
     Split a Dict observation, such as that of a goal environment, by keys; entries are flattened and concatenated.
 
-    :param env: with a flat Dict observation of Box entries
+    :param env: environment with a flat Dict observation of Box entries
     :param partial: keys of what the deployed policy will see; as a mapping, key -> indices into the flattened entry,
         or ``None`` for all of it
-    :param privileged: likewise for what only training sees
+    :param privileged: entries that only training sees, in the same form
     :param keep: keys of entries that stay beside the two, with their shapes, such as the goals that ``HerReplayBuffer`` needs
     :raises ValueError: if the observation is of another kind, or a key or an index is unknown
     """
@@ -163,7 +163,7 @@ class SensorNoise(EntryWrapper):
     The noise has a generator of its own, seeded by ``reset(seed=...)``: the environment's random numbers, and with
     them its dynamics, are the same whatever ``noise_std`` is.
 
-    :param env: with a Dict observation
+    :param env: environment with a Dict observation
     :param noise_std: standard deviation, in the units of the entry: a number, or one per component
     :param key: the entry that becomes noisy
     :raises ValueError: if ``noise_std`` is negative or of another shape, or the entry is missing or of integers
@@ -201,7 +201,7 @@ class History(EntryWrapper):
 
     At reset the first value fills the whole history, and past actions are zero.
 
-    :param env: with a Dict observation
+    :param env: environment with a Dict observation
     :param length: values kept, the current one included
     :param actions: whether to append the ``length - 1`` actions between them (Box actions, one-dimensional float entry)
     :param key: the entry that gets a history
@@ -252,7 +252,7 @@ class PreviousAction(EntryWrapper):
 
     Zeros at reset.  Policies that remember need it where the dynamics depend on their actions.
 
-    :param env: with a Dict observation
+    :param env: environment with a Dict observation
     :param reward: whether to append the previous reward as well
     :param key: the entry
     :raises ValueError: if the entry is not a floating-point vector, or the actions are neither Box nor Discrete

@@ -80,12 +80,12 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
         ``behaviour`` must give the learner a share of them
     :param kl_coef: weight alpha of the KL: "auto" (learned, eq. 17), "auto_<start value>" or a number
     :param kl_coef_bounds: smallest and largest value of a learned ``kl_coef``
-    :param kl_coef_learning_rate: of a learned ``kl_coef``
+    :param kl_coef_learning_rate: Adam's step size for a learned ``kl_coef``
     :param kl_reduction: KL over action dimensions: "mean" or "sum"
     :param guider: "residual": learner plus a privileged correction; "lagged": the learner's Polyak average plus one;
         "independent": a network of its own (the paper's)
     :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
-    :param shared_std: whose standard deviation both policies have, "learner" or "guider"; the other borrows it as a constant.
+    :param shared_std: policy whose standard deviation both have, "learner" or "guider"; the other borrows it as a constant.
         "auto" is the guider's, the paper's, unless the guider is relative to the learner and that has an entropy term
     :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto" is 1,
         the paper's, and 0 with a residual guider, whose KL does not depend on the learner: a pull towards it closes no gap,

@@ -42,7 +42,7 @@ class Preset:
     """
     A file of arguments, as it is.
 
-    :param name: of the file
+    :param name: name of the preset's file
     :param run: environments side by side that ``gradient_steps`` is meant for, ``envs``; and what a benchmark's suite has if
         it says nothing else: ``steps``, ``eval_episodes`` and ``eval_deterministic``
     :param arguments: "all" or the name of an algorithm -> arguments

@@ -52,11 +52,11 @@ class BatchVecEnv(VecEnv):
     The environments share one simulator: attributes are those of this object, set for all of them at once.
 
     :param n_envs: number of environments
-    :param observation_space: of one environment as the simulator has it: a Box, or a Dict of Boxes
-    :param action_space: of one environment; Box actions are clipped to it
+    :param observation_space: space of one environment's observation as the simulator gives it: a Box, or a Dict of Boxes
+    :param action_space: space of one environment's actions; Box actions are clipped to it
     :param partial: what of the observation the deployed policy sees: indices or a slice of a Box, keys of a Dict, or a mapping
         from keys to indices, slices or ``None`` for all
-    :param privileged: likewise what only training sees
+    :param privileged: what only training sees, in the same form
     :param time_limit: steps after which an episode is truncated, ``None`` for no limit of the adapter's own
     :param noise_std: standard deviation of the noise on ``partial``, a number or one per component; 0 for none
     :raises ValueError: naming the argument that is wrong

@@ -33,18 +33,18 @@ class EnvPoolVecEnv(BatchVecEnv):
     ignores; here the new episode begins at once. The time limit is counted here, so that an end of the task in its last step
     is known for one.
 
-    :param task_id: of EnvPool, such as "MuJoCoPlayground/Go1JoystickFlatTerrain-v1"
+    :param task_id: EnvPool's name of the task, such as "MuJoCoPlayground/Go1JoystickFlatTerrain-v1"
     :param n_envs: number of environments
     :param partial: what of the observation the deployed policy sees: indices or a slice of a flat one, keys of a dict, or a
         mapping from keys to indices, slices or ``None`` for all
-    :param privileged: likewise what only training sees
+    :param privileged: what only training sees, in the same form
     :param time_limit: steps after which an episode is truncated, by default the task's own
     :param noise_std: standard deviation of Gaussian noise on ``partial``, beside any that the task has itself
     :param num_threads: of the pool, by default as many as there are cores that torch's threads leave, at least one. Both wait
         by spinning: where they are more than the cores, each step and each gradient step takes many times as long
         (``torch.set_num_threads``)
     :param info_keys: names in EnvPool's infos that the infos here are to have, such as "success"
-    :param kwargs: of EnvPool, such as ``noise_level``
+    :param kwargs: further arguments of EnvPool, such as ``noise_level``
     :raises ValueError: if there is no such task, or naming the argument that is wrong
     :raises ImportError: if EnvPool is not installed, saying how to
     """

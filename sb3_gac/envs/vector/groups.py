@@ -30,7 +30,7 @@ class GroupsVecEnv(BatchVecEnv):
 
     :param simulator: with the above, wrapped or not
     :param partial: groups that the deployed policy sees, or a mapping from groups to indices into them
-    :param privileged: likewise what only training sees
+    :param privileged: groups that only training sees, in the same form
     :param max_action: bound of Box actions where the simulator's have none
     :param final_key: of ``extras``, under which there are the groups of the last observations, of shape (N, ...); rows count
         where an episode has ended

@@ -10,10 +10,11 @@ from sb3_gac.envs.suites import batch_factory, is_batched
 
 def make_vec(env_id: str, n_envs: int = 1, seed: int | None = None, **kwargs: Any) -> VecEnv:
     """
-    :param env_id: of gymnasium; those of suites whose simulator steps a batch become one simulator of ``n_envs`` environments
+    :param env_id: id of a registered environment; those of suites whose simulator steps a batch become one simulator of
+        ``n_envs`` environments
     :param n_envs: side by side
-    :param seed: of the first one, the others have the next ones; ``None`` for a random one
-    :param kwargs: of the environment
+    :param seed: seed of the first environment, the others have the next ones; ``None`` for a random one
+    :param kwargs: arguments of the environment, such as ``noise_std``
     :return: environments whose infos have returns and lengths of episodes
     :raises ImportError: if the simulator is not installed, saying how to
     :raises ValueError: if ``delay`` or ``drop`` is asked of a simulator that steps a batch
