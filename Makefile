@@ -63,7 +63,7 @@ table: $(VENV)/.installed-dev  ## a table of the paper by number (N=2 to 8), and
 	$(BIN)/python -m benchmarks.paper table $(N)
 
 docs: $(VENV)/.installed-docs  ## the documentation as a site, build/site/index.html
-	$(BIN)/mkdocs build --quiet --strict --site-dir build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --site-dir build/site
 
 package: $(VENV)/.installed-dev  ## a wheel and an sdist in dist/, which pip installs anywhere
 	$(BIN)/python -m build --outdir dist .

@@ -13,6 +13,7 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(?<=\]\()(\.\./[^)#\s]+)")
 CHANGELOG, CHANGES = "CHANGELOG.md", "changes.md"
+CODE = re.compile(r"(``.*?``)", re.DOTALL)
 ROLE = re.compile(r":(?:class|meth|func|attr|mod|data|exc|obj):`([~.\w]+)`")
 
 
@@ -68,8 +69,10 @@ class DocstringMarkup(griffe.Extension):
         :param kwargs: the loader
         """
         if obj.docstring is not None:
-            obj.docstring.value = ROLE.sub(lambda role: _link(role[1], obj), obj.docstring.value)
-            obj.docstring.value = re.sub(r"::$", ":", obj.docstring.value, flags=re.MULTILINE)
+            text = re.sub(r"::$", ":", obj.docstring.value, flags=re.MULTILINE)
+            parts = CODE.split(text)  # every other one is code, which stays as it is
+            parts[::2] = [ROLE.sub(lambda role: _link(role[1], obj), part.replace("<", "&lt;")) for part in parts[::2]]
+            obj.docstring.value = "".join(parts)
 
 
 def _link(name: str, obj: griffe.Object) -> str:

@@ -12,6 +12,7 @@ import yaml
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 GENERATED = {"changes.md"}
+CODE = re.compile(r"^```.*?^```|`[^`\n]+`", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 
 
@@ -30,7 +31,7 @@ def test_every_page_is_in_the_navigation_once():
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page):
-    links = [link for link in LINK.findall(page.read_text()) if not re.match(r"\w+:", link)]
+    links = [link for link in LINK.findall(CODE.sub("", page.read_text())) if not re.match(r"\w+:", link)]
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
@@ -51,7 +52,7 @@ def test_the_site_has_every_page_and_what_pages_show_of_the_repository(site):
         html = (site / page.relative_to(ROOT / "docs")).with_suffix(".html")
         shown = re.findall(r'<img[^>]* src="([^":]+)"', html.read_text())
         assert [source for source in shown if not (html.parent / source).resolve().is_file()] == [], html.name
-    assert "Changelog" in (site / "changes.html").read_text() or (site / "changes.html").stat().st_size > 10_000
+    assert "(unreleased)" in (site / "changes.html").read_text()
 
 
 def test_docstrings_are_shown_as_they_are_meant(site):
