@@ -18,10 +18,11 @@ from benchmarks import aggregate, launch
 from benchmarks.comparison_page import page
 from benchmarks.config import check_programs, check_simulators
 from benchmarks.environments import EVAL_SEED, make_envs
-from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, findings, recommendation, worth
+from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, counted, findings, recommendation, worth
 from benchmarks.suite import NAME, RunSpec, default_name, read_definitions, read_suite
 from benchmarks.tidy import read_tidy
 from benchmarks.yaml_checks import check_is
+from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 from sb3_gac.optim.compile import PAYS_FROM, missing_compiler
 from sb3_gac.presets import PRESETS, read_preset
@@ -169,13 +170,28 @@ def run(options: argparse.Namespace) -> Path:
     jobs, finished = launch.jobs_left(suite, runs)
     check_programs(job.spec for job in jobs)
     check_simulators(job.spec for job in jobs)
-    print(f"{len(jobs)} runs of {options.steps:,} steps to do, {finished} done; all is in {options.out}.", flush=True)
+    _check_goals(read_suite(suite)[0])
+    left = f"{counted(len(jobs), 'run')} of {options.steps:,} steps to do"
+    print(f"{left}, {finished} done; all is in {options.out}.", flush=True)
     engine = launch.LocalEngine() if options.ray is None else launch.RayEngine(options.ray)
     launch.launch(jobs, options.jobs or engine.cpus, 1, engine, finished)
     if failed := [job for job in jobs if job.state == "failed"]:
         logs = "\n".join(f"  {job.log}: {job.reason}" for job in failed)
-        raise ValueError(f"{len(failed)} runs failed. Their logs say why; then the same command goes on:\n{logs}")
+        raise ValueError(f"{counted(len(failed), 'run')} failed. The logs say why; then the same command goes on:\n{logs}")
     return write_results(options, suite, runs)
+
+
+def _check_goals(spec: RunSpec) -> None:
+    """Goals as entries of their own are for ``HerReplayBuffer``, and no algorithm here reads them."""
+    env = make_envs(spec, 1)
+    entries = env.observation_space.spaces  # type: ignore[attr-defined]
+    env.close()
+    if DESIRED_GOAL in entries:
+        raise ValueError(
+            f'--env: the observation has the entry "{DESIRED_GOAL}", which no algorithm here reads, and without which none '
+            "can do well. Put it into `partial`: --wrappers sb3_gac.envs:AppendDesiredGoal, around all others; of registered "
+            "tasks, leave goal_entries out. There is no comparison with HerReplayBuffer."
+        )
 
 
 def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:

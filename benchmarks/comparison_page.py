@@ -10,6 +10,7 @@ from plotly import graph_objects
 
 from benchmarks.headroom import (
     Worth,
+    counted,
     findings,
     headroom_curve,
     in_words,
@@ -132,10 +133,10 @@ def _how(found: Worth, command: str, results: Path, steps: int) -> str:
     seeds = max(len(end) for end in found.ends.values())
     origin = {key: made[key] for key in ("made_with", "cpus", "hours", "settings", "arguments") if key in made}
     return (
-        f"<h2>How it was made</h2><p>{seeds} seeds of each algorithm, {steps:,} environment steps each. A run's end is the "
-        "mean of the last quarter of its evaluations, on environments that training never sees. Intervals of differences are "
-        "Welch's t intervals over seeds. “What was learned” is the distance from the return of random actions to the best "
-        "mean end; less than a twentieth of it counts as no difference.</p>"
+        f"<h2>How it was made</h2><p>{counted(seeds, 'seed')} of each algorithm, {steps:,} environment steps "
+        "each. A run's end is the mean of the last quarter of its evaluations, on environments that training never sees. "
+        "Intervals of differences are Welch's t intervals over seeds. “What was learned” is the distance from the return of "
+        "random actions to the best mean end; less than a twentieth of it counts as no difference.</p>"
         f"<pre>{html.escape(command)}</pre>"
         f"<details><summary>Settings and versions</summary><pre>{html.escape(json.dumps(origin, indent=1))}</pre></details>"
     )

@@ -188,6 +188,15 @@ def number(value: float) -> str:
     return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
 
 
+def counted(number: int, noun: str) -> str:
+    """
+    :param number: of things
+    :param noun: for one of them, whose plural has an s
+    :return: such as "1 run" or "2 runs"
+    """
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def recommendation(found: Worth, steps: int) -> list[str]:
     """
     :param found: of runs

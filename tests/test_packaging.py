@@ -1,6 +1,7 @@
 """What an installation brings: extras that are named where they are missing, and a path that type checkers can follow."""
 
 import configparser
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ env = sb3_gac.envs.make_pendulum()
 model = sb3_gac.GAC("MultiInputPolicy", env, buffer_size=10, policy_kwargs={"net_arch": [4]})
 sb3_gac.export_learner(model, "never-written.onnx")
 """
+RUNS_BENCHMARKS = r"python -m (benchmarks|sb3_gac\.compare)"
 PARTS = {  # extra -> what of it is needed, and what needs it
     "zoo": (["rl_zoo3", "optuna"], "import sb3_gac.zoo"),
     "export": (["onnx"], EXPORT),
@@ -56,6 +58,16 @@ def test_extras_bring_what_their_parts_need():
         lines = parser["options.extras_require"][part.split(",")[0]].split("\n")
         names = {Requirement(line).name for line in lines if line}
         assert set(modules) - {"optuna", "omegaconf"} <= names, "which come with rl_zoo3 and sheeprl"
+
+
+def test_a_block_of_commands_installs_all_that_it_runs():
+    """In the docs: what runs the benchmarks needs their extra, also where it is about another one."""
+    pages = [path.read_text() for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))]
+    blocks = [block for page in pages for block in re.findall(r"^```\w*\n(.*?)^```", page, re.DOTALL | re.MULTILINE)]
+    installed = {block: re.findall(r'pip install -e "\.\[([\w,]+)\]"', block) for block in blocks}
+    running = {block: extras for block, extras in installed.items() if extras and re.search(RUNS_BENCHMARKS, block)}
+    assert len(running) >= 3
+    assert [block for block, extras in running.items() if "benchmarks" not in ",".join(extras).split(",")] == []
 
 
 @pytest.fixture

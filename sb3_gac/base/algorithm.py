@@ -30,6 +30,7 @@ from sb3_gac.checks.arguments import (
     check_arguments,
     make_arguments_plain,
 )
+from sb3_gac.checks.requirements import warn_of_an_unseen_goal
 from sb3_gac.checks.values import plain
 from sb3_gac.networks.heads import check_action_space
 from sb3_gac.optim.coefficients import Coefficient, DualVariable, LearnedCoefficient
@@ -124,8 +125,10 @@ class AsymmetricAlgorithm(
             raise ValueError("env must be an environment, got None: load() alone can do without.")
         check_action_space(type(self).__name__, self.action_space)
         check_arguments(self)
-        resolve_role_keys(self.observation_space, self.policy_class.roles, self.role_keys)
-        resolve_lr_scales(self.policy_class.roles, self.lr_scales)
+        roles = self.policy_class.roles
+        seen = resolve_role_keys(self.observation_space, roles, self.role_keys)[roles.deployed]
+        warn_of_an_unseen_goal(roles.deployed, seen, self.observation_space)
+        resolve_lr_scales(roles, self.lr_scales)
         if MEMORY in (self.lr_scales or {}) and not self.is_recurrent:
             raise ValueError(f'lr_scales names "{MEMORY}", but no network has one: leave it out, or choose an rnn_type.')
 

@@ -1,6 +1,7 @@
 """What algorithms and SB3's ``HerReplayBuffer`` need of an environment, looked at before training."""
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -37,6 +38,23 @@ def check_environment(env: GymEnv) -> None:
     check_entries(env.observation_space)
     if isinstance(env.action_space, spaces.Box):
         check_box_actions(env.action_space)
+
+
+def warn_of_an_unseen_goal(role: str, seen: Collection[str], space: spaces.Space) -> None:
+    """
+    Warn if a goal is an entry of its own that the deployed policy does not read: it would learn to do well on average.
+
+    :param role: of the deployed policy
+    :param seen: entries that it reads
+    :param space: of the observations
+    """
+    goal = GOALS[1]
+    if isinstance(space, spaces.Dict) and goal in space.spaces and goal not in seen:
+        warnings.warn(
+            f'The {role} does not read the entry "{goal}", so it can\'t know what it is to reach: '
+            f'role_keys={{"{role}": {[*seen, goal]}}}, or sb3_gac.envs.AppendDesiredGoal around the environment.',
+            stacklevel=3,
+        )
 
 
 def check_goals(buffer_class: Any, space: spaces.Dict, env: VecEnv | None) -> None:

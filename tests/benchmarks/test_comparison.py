@@ -157,6 +157,7 @@ def test_a_function_that_makes_an_environment(engine, monkeypatch, tmp_path):
         (["--env", "NoSuchEnvironment-v7"], "NoSuchEnvironment"),
         (["--env", "no_such_module:make"], "no_such_module"),
         ([*SHORT, "--overrides", "{gama: 0.9}"], "gama"),
+        (["--env", "sb3_gac/FetchReach-v4", "--env-kwargs", "{goal_entries: true}"], "sb3_gac.envs:AppendDesiredGoal"),
     ],
 )
 def test_what_is_wrong_is_said_before_the_first_run(engine, monkeypatch, arguments, message):
@@ -185,7 +186,7 @@ def test_a_run_that_fails_is_named_with_its_log(engine, monkeypatch):
     monkeypatch.setattr(engine, "run", lambda command, log: 1)
     with pytest.raises(SystemExit) as stop:
         _compare(monkeypatch, *SHORT, "--seeds", 1, "--algorithms", "sac")
-    assert "1 runs failed" in str(stop.value)
+    assert "1 run failed" in str(stop.value)
     assert "seed0/log.txt" in str(stop.value)
 
 

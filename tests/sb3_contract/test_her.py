@@ -1,5 +1,7 @@
 """SB3's contract: goal environments with HerReplayBuffer, where the learner reads entries of its own choice."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -44,6 +46,18 @@ def _check_goal_environment(algorithm, image):
 @with_goals
 def test_goal_environments(algorithm):
     _check_goal_environment(algorithm, image=False)
+
+
+@with_goals
+def test_a_goal_that_the_deployed_policy_does_not_read_is_told(algorithm):
+    """It would learn what is best on average over goals, and nothing would fail."""
+    role = deployed_role(algorithm)
+    said = rf"The {role} does not read the entry \"desired_goal\".*role_keys={{\"{role}\": \['observation', 'desired_goal'\]}}"
+    with pytest.warns(UserWarning, match=said):
+        make(algorithm, _env(), role_keys={role: ["observation"]})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        _make(algorithm, _env())
 
 
 def test_goal_environments_with_images():
