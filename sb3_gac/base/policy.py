@@ -320,8 +320,9 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
 
         :param mode: True for training
         """
-        for role in self.trained:
-            getattr(self, role).train(mode)
+        for network in [getattr(self, role) for role in self.trained]:
+            if network.training != mode:  # for each of its layers it takes as long as a small network's forward pass
+                network.train(mode)
         self.training = mode
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
