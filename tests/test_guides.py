@@ -107,7 +107,7 @@ def test_defaults_in_the_tables_of_arguments_are_so(heading):
 
 
 def test_every_preset_is_described():
-    assert set(_table("Presets")) == set(PRESETS) - {"paper-brax"}, "which is the preset paper"
+    assert set(_table("Presets")) == set(PRESETS)
 
 
 def test_every_extra_that_a_user_may_need_is_named_where_installing_is_explained():
