@@ -68,7 +68,8 @@ def test_a_terminal_has_a_bar_and_a_file_has_lines(is_terminal, monkeypatch, cap
     model.learn(60, callback=[evaluation, Progress(evaluation, 60)])
     lines = capsys.readouterr().out.splitlines()
     if is_terminal:
-        last = screen.getvalue().split("\r")[-1]
+        first, *_, last = filter(str.strip, screen.getvalue().split("\r"))
+        assert "warm-up" in first, "a note would stand behind a bar that is not whole yet"
         assert "100%" in last
         assert "60/60  learner " in last
         assert "  KL " in last
@@ -121,5 +122,7 @@ def test_the_curve_marks_warm_up_and_random_actions(with_guider, tmp_path, monke
         {"guider (privileged)"} if with_guider else set()
     )
     assert set(labels["random actions"].get_ydata()) == {-3.0}
+    of_kl = {line.get_label(): list(line.get_ydata())[-1] for axis in others for line in axis.get_lines()}
+    assert of_kl == ({"KL(guider ‖ learner)": 0.1, "target": 0.2} if with_guider else {})
     assert labels["warm-up"].get_extents().transformed(returns.transData.inverted()).x1 == pytest.approx(2000)
     plt.close(figure)
