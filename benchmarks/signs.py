@@ -1,15 +1,17 @@
 """
-The pictures of docs/signs.md, from the committed results of the suite ``signs``::
+The pictures of docs/signs.md, from committed results::
 
     python -m benchmarks.launch benchmarks/suites/signs.yml
     python -m benchmarks.aggregate benchmarks/suites/signs.yml --out benchmarks/results/signs
     python -m benchmarks.signs
 
-writes ``benchmarks/results/signs-<what is wrong>.png``, each with a healthy run behind a sick one, and prints what they show.
+writes ``benchmarks/results/signs-<name>.png``, each with healthy runs behind sick ones, and prints what they show. Pictures
+whose results are not there are named, and left out.
 """
 
 import argparse
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib
 import pandas as pd
@@ -20,14 +22,66 @@ from benchmarks.tidy import read_tidy
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
-HEALTHY = "gac"
-#: Algorithm of the suite -> what is wrong with it
-SICK = {
-    "gac-kl-too-large": "target_kl too large",
-    "gac-kl-too-small": "target_kl too small",
-    "gac-guider-far": "guider far",
-    "gac-saturated": "saturated actions",
+
+class Runs(NamedTuple):
+    """
+    One algorithm in one cell of some results.
+
+    :param results: name of the results, in ``benchmarks/results``
+    :param algorithm: its name in the suite
+    :param task: title of the cell's task
+    :param noise: standard deviation of the cell's sensor noise
+    """
+
+    results: str
+    algorithm: str
+    task: str
+    noise: float
+
+    def read(self, folder: Path) -> pd.DataFrame:
+        """
+        :param folder: of all results
+        :return: evaluations of all seeds, none if there are no such results
+        """
+        path = folder / f"{self.results}.csv"
+        if not path.exists():
+            return pd.DataFrame()
+        tidy = read_tidy(path)
+        return tidy[(tidy.algorithm == self.algorithm) & (tidy.task == self.task) & (tidy.noise == self.noise)]
+
+
+class Picture(NamedTuple):
+    """
+    Sick runs with healthy ones behind them.
+
+    :param label: what is wrong
+    :param healthy: runs in grey
+    :param sick: runs in red
+    """
+
+    label: str
+    healthy: Runs
+    sick: Runs
+
+
+PENDULUM = ("Pendulum-history4", 0.2)
+HEALTHY = Runs("signs", "gac", *PENDULUM)
+#: Name in the file -> what it shows
+PICTURES = {
+    "target-kl-too-large": Picture("target_kl too large", HEALTHY, Runs("signs", "gac-kl-too-large", *PENDULUM)),
+    "target-kl-too-small": Picture("target_kl too small", HEALTHY, Runs("signs", "gac-kl-too-small", *PENDULUM)),
+    "guider-free": Picture("fixed, small kl_coef", HEALTHY, Runs("signs", "gac-guider-far", *PENDULUM)),
+    "guider-far": Picture(
+        "two networks",
+        Runs("halfcheetah", "gac", "HalfCheetah", 0.3),
+        Runs("independent", "gac-independent", "HalfCheetah", 0.3),
+    ),
+    "saturated-actions": Picture("saturated actions", HEALTHY, Runs("signs", "gac-saturated", *PENDULUM)),
+    "sees-too-little": Picture(
+        "no memory", Runs("memory", "gac-gru", "Pendulum", 0.05), Runs("memory", "gac", "Pendulum", 0.05)
+    ),
 }
 #: Column of the results, or what is made of two -> title of its axes
 PANELS = {
@@ -40,34 +94,37 @@ LOGARITHMIC = ("ratio", "kl_coef")
 GREY, RED = "#8a8a8a", "#d62728"
 
 
-def draw(tidy: pd.DataFrame, algorithm: str, path: Path) -> None:
+def draw(label: str, healthy: pd.DataFrame, sick: pd.DataFrame, path: Path) -> None:
     """
-    One panel beside the other: what the logs of a sick run show, and of a healthy one.
+    One panel beside the other: what the logs of sick runs show, and of healthy ones.
 
-    :param tidy: as aggregated
-    :param algorithm: the sick one, a key of ``SICK``
+    :param label: what is wrong
+    :param healthy: evaluations of healthy runs
+    :param sick: evaluations of sick ones
     :param path: of the picture
     """
-    figure, axes = plt.subplots(1, len(PANELS), figsize=(3.2 * len(PANELS), 2.9), layout="constrained")
-    for name, color, label in ((HEALTHY, GREY, "healthy"), (algorithm, RED, SICK[algorithm])):
-        for number, (_, run) in enumerate(tidy[tidy.algorithm == name].groupby("seed")):
-            for axis, panel in zip(axes, PANELS, strict=True):
-                _plot(axis, panel, run, color, label if number == 0 else None)
-    for axis, (panel, title) in zip(axes, PANELS.items(), strict=True):
-        axis.set_title(title, fontsize=9)
+    panels = [panel for panel in PANELS if panel != "learner_mean_abs" or panel in sick]
+    figure, axes = plt.subplots(1, len(panels), figsize=(3.2 * len(panels), 2.9), layout="constrained")
+    for runs, color, name in ((healthy, GREY, "healthy"), (sick, RED, label)):
+        for number, (_, run) in enumerate(runs.groupby("seed")):
+            for axis, panel in zip(axes, panels, strict=True):
+                _plot(axis, panel, run, color, name if number == 0 else None)
+    for axis, panel in zip(axes, panels, strict=True):
+        axis.set_title(PANELS[panel], fontsize=9)
         axis.set_xlabel("environment steps", fontsize=8)
         axis.tick_params(labelsize=8)
+        axis.xaxis.set_major_locator(MaxNLocator(4))
         axis.grid(alpha=0.25)
         if panel in LOGARITHMIC:
             axis.set_yscale("log")
-    axes[list(PANELS).index("ratio")].axhline(1.0, color="black", linestyle=":", linewidth=1)
+    axes[panels.index("ratio")].axhline(1.0, color="black", linestyle=":", linewidth=1)
     axes[0].legend(fontsize=8, frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
 def _plot(axis: Axes, panel: str, run: pd.DataFrame, color: str, label: str | None) -> None:
-    """:param run: rows of one seed"""
+    """:param run: evaluations of one seed"""
     if panel == "returns":
         axis.plot(run.timesteps, run.learner, color=color, label=label)
         axis.plot(run.timesteps, run.guider, color=color, linestyle="--")
@@ -76,35 +133,35 @@ def _plot(axis: Axes, panel: str, run: pd.DataFrame, color: str, label: str | No
     axis.plot(run.timesteps, values, color=color)
 
 
-def described(tidy: pd.DataFrame, algorithm: str) -> str:
+def described(runs: pd.DataFrame) -> str:
     """
-    :param tidy: as aggregated
-    :param algorithm: one that is in it
-    :return: a line with what its last evaluations found, of each seed
+    :param runs: evaluations of one algorithm in one cell
+    :return: what the last evaluation of each seed found
     """
-    last = tidy[tidy.algorithm == algorithm].sort_values("timesteps").groupby("seed").tail(1)
+    last = runs.sort_values("timesteps").groupby("seed").tail(1)
     found = {
         "learner": last.learner.round(0).astype(int),
         "guider": last.guider.round(0).astype(int),
         "kl / target": (last.kl / last.target_kl).round(3),
         "kl_coef": last.kl_coef.round(4),
-        "learner_mean_abs": last.learner_mean_abs.round(2),
     }
-    return f"{algorithm}: " + ", ".join(f"{name} {values.tolist()}" for name, values in found.items())
+    if "learner_mean_abs" in last:
+        found["learner_mean_abs"] = last.learner_mean_abs.round(2)
+    return ", ".join(f"{name} {values.tolist()}" for name, values in found.items())
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path, nargs="?", default=HERE / "results/signs", help="without a suffix")
-    results = parser.parse_args().results
-    tidy = read_tidy(results.with_suffix(".csv"))
-    print(described(tidy, HEALTHY))
-    for algorithm in SICK:
-        if algorithm in set(tidy.algorithm):
-            path = results.with_name(f"{results.name}-{SICK[algorithm].replace(' ', '-').replace('_', '-')}.png")
-            draw(tidy, algorithm, path)
-            print(described(tidy, algorithm), path, sep="\n")
+    parser.add_argument("folder", type=Path, nargs="?", default=HERE / "results", help="with all results")
+    folder = parser.parse_args().folder
+    for name, picture in PICTURES.items():
+        healthy, sick = picture.healthy.read(folder), picture.sick.read(folder)
+        if healthy.empty or sick.empty:
+            print(f"{name}: not drawn, runs of the suites {picture.healthy.results} and {picture.sick.results} are missing")
+            continue
+        draw(picture.label, healthy, sick, folder / f"signs-{name}.png")
+        print(f"{name}: healthy: {described(healthy)}\n{name}: sick: {described(sick)}")
 
 
 if __name__ == "__main__":
