@@ -10,12 +10,14 @@ reads ``halfcheetah.csv`` and ``halfcheetah.json`` and writes the figure as ``.p
 import argparse
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
 
 from benchmarks.page.document import page
 from benchmarks.page.plots import (
@@ -37,7 +39,6 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 FORMATS = ("png", "pdf", "svg")
-MOST_NAMES = 3  # in a line of the legend below one task
 
 
 def draw(tidy: pd.DataFrame, paths: Sequence[Path]) -> None:
@@ -73,11 +74,20 @@ def draw(tidy: pd.DataFrame, paths: Sequence[Path]) -> None:
                 axis.text(0.5, 0.5, NOT_RUN if wanted else "", ha="center", transform=axis.transAxes)
     shown = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     names = [name for name in algorithms if name in shown]
-    columns = min(len(names), MOST_NAMES * len(tasks))
-    figure.legend([shown[name] for name in names], names, loc="outside lower center", ncols=columns, fontsize="small")
+    _legend_below(figure, {name: shown[name] for name in names})
     for path in paths:
         figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _legend_below(figure: Figure, lines: Mapping[str, Artist]) -> None:
+    """As many names side by side as the figure is wide."""
+    for columns in range(len(lines), 0, -1):
+        legend = figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=columns, fontsize="small")
+        if legend.get_window_extent().width <= figure.bbox.width:
+            return
+        if columns > 1:
+            legend.remove()
 
 
 def cells_table(cells: list[dict[str, Any]]) -> str:

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 import benchmarks.bootstrap
 from benchmarks.aggregate import compare, summarise_cells
 from benchmarks.page.plots import palette
-from benchmarks.report import interactive, main
+from benchmarks.report import draw, interactive, main
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -63,6 +64,19 @@ def test_the_figure_comes_in_all_formats(tmp_path, monkeypatch):
     assert set(made) == {".csv", ".json", ".html", ".png", ".pdf", ".svg"}
     assert made[".pdf"].startswith(b"%PDF")
     assert b"<svg" in made[".svg"]
+
+
+def test_a_figure_of_one_cell_names_all_of_its_algorithms(tmp_path, monkeypatch):
+    """However long their names are, no line of the legend is wider than the figure."""
+    legends, make = [], Figure.legend
+    monkeypatch.setattr(Figure, "legend", lambda *args, **kwargs: legends.append(make(*args, **kwargs)) or legends[-1])
+    names = [f"guided-actor-critic-with-option-{number}" for number in range(7)]
+    tidy = _tidy(names)
+    draw(tidy[tidy.task == "Ant"], [tmp_path / "figure.png"])
+    *tried, kept = legends
+    assert tried, "all names in a line would be wider"
+    assert kept.get_window_extent().width <= kept.figure.bbox.width
+    assert [text.get_text() for text in kept.get_texts()] == names
 
 
 @pytest.mark.parametrize("name", COMMITTED)
