@@ -16,9 +16,8 @@ import sb3_gac
 from benchmarks.contenders import timer
 from benchmarks.models import make_model, matmul_rate, step_flops
 
-COMPILED = ("optim/compile.py", "__call__")  # losses, gradients, clipping, optimisers and dual variables
+COMPILED = ("optim/compile.py", "__call__")  # losses, gradients, clipping, optimisers, dual variables and targets
 PARTS = {  # of a compiled gradient step -> file and function, none of which calls another
-    "targets": ("base/policy.py", "update_targets"),
     "sampling": ("replay/buffer.py", "sample"),
 }
 

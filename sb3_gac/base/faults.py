@@ -160,10 +160,14 @@ class FaultTolerance(BaseAlgorithm):
         guard = guard_of(self.env)
         self._last_use = (guard, guard.uses)
 
+    def used_elsewhere(self, env: VecEnv) -> bool:
+        """Whether somebody else has stepped or reset the environments since the last use, or they are others than then."""
+        guard = guard_of(env)
+        return self._last_use != (guard, guard.uses)
+
     def reset_if_used_elsewhere(self, env: VecEnv) -> None:
         """Episodes under way end where somebody else has stepped or reset the environments, or they are others than before."""
-        guard = guard_of(env)
-        if self._last_obs is not None and self._last_use == (guard, guard.uses):
+        if self._last_obs is not None and not self.used_elsewhere(env):
             return
         if self._last_obs is not None and not self._used_elsewhere_said:
             warnings.warn(

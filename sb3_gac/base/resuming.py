@@ -16,6 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 from stable_baselines3.common.type_aliases import GymEnv, TrainFreq
+from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
 from sb3_gac.base.arguments import present_names
@@ -66,6 +67,7 @@ class ResumableAlgorithm(BaseAlgorithm):
     policy: AsymmetricPolicy
     _change_arguments: Callable[[dict[str, Any]], None]
     note_use: Callable[[], None]
+    used_elsewhere: Callable[[VecEnv], bool]
     #: Given the directory of all checkpoints: what is to be written of the data that training holds, and names of blocks
     #: that were written there
     save_data: Callable[[Path], tuple[dict[str, Any], list[str]]]
@@ -113,6 +115,7 @@ class ResumableAlgorithm(BaseAlgorithm):
             "training_state": encode(self.training_state(), arrays),
             "generators": encode(self._generator_states(), arrays),
             "env": encode(None if self.env is None else vec_env_state(self.env), arrays),
+            "used_elsewhere": self.env is not None and self.used_elsewhere(self.env),
             "buffer": encode(data, arrays),
             "notes": notes,
         }
@@ -202,6 +205,8 @@ class ResumableAlgorithm(BaseAlgorithm):
         tensors = th.load(io.BytesIO(files[_TENSORS]), map_location=model.device, weights_only=True)
         with networks_named(path, list(given)):
             model._restore(root, tensors, {name: decode(state[name], arrays) for name in STATES if name in state})
+        if not state.get("used_elsewhere", False):
+            model.note_use()
         if model.seed is not None and model.seed != before.get("seed"):
             model.set_random_seed(model.seed)
         vars(model).update(settings)
@@ -243,7 +248,6 @@ class ResumableAlgorithm(BaseAlgorithm):
             warnings.warn(f"Starting new episodes: the environments cannot be restored ({why}).", stacklevel=4)
             self._last_obs = None
             self.env.seed(int(generators["numpy"][1][0]) % 2**31)  # the same for the same checkpoint
-        self.note_use()
 
     def _restore_generators(self, states: dict[str, Any]) -> None:
         """Last: whatever else is restored may draw random numbers."""

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer
@@ -813,6 +813,13 @@ class _Story:
     n_envs=st.integers(1, 3),
     length=st.integers(1, 6),
     terminates=st.booleans(),
+)
+@example(
+    events=[("learn", 1, False), ("evaluate", 1, False), ("resume", 0, False)],
+    kind=KINDS[0],
+    n_envs=1,
+    length=1,
+    terminates=False,
 )
 def test_whatever_happens_the_buffer_holds_what_was_done(tmp_path_factory, events, kind, n_envs, length, terminates):
     story = _Story(tmp_path_factory.mktemp("story"), kind, n_envs, length, terminates)
