@@ -321,7 +321,7 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         :param mode: True for training
         """
         for network in [getattr(self, role) for role in self.trained]:
-            if network.training != mode:  # for each of its layers it takes as long as a small network's forward pass
+            if network.training != mode:  # which goes through all of its layers, at every prediction of a guider
                 network.train(mode)
         self.training = mode
 

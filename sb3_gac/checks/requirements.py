@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_gac.checks.entries import check_entries, stored_shape
 from sb3_gac.checks.values import check_box_actions
 
-GOALS = ("achieved_goal", "desired_goal")
+_, DESIRED_GOAL = GOALS = ("achieved_goal", "desired_goal")
 REWARDS_OF_GOALS = (
     "HerReplayBuffer calls compute_reward(achieved_goals, desired_goals, infos) with N rows of each, and needs N rewards, as "
     "an array of shape (N,): take norms and comparisons along the last axis, and return no single number."
@@ -48,11 +48,10 @@ def warn_of_an_unseen_goal(role: str, seen: Collection[str], space: spaces.Space
     :param seen: entries that it reads
     :param space: of the observations
     """
-    goal = GOALS[1]
-    if isinstance(space, spaces.Dict) and goal in space.spaces and goal not in seen:
+    if isinstance(space, spaces.Dict) and DESIRED_GOAL in space.spaces and DESIRED_GOAL not in seen:
         warnings.warn(
-            f'The {role} does not read the entry "{goal}", so it can\'t know what it is to reach: '
-            f'role_keys={{"{role}": {[*seen, goal]}}}, or sb3_gac.envs.AppendDesiredGoal around the environment.',
+            f'The {role} does not read the entry "{DESIRED_GOAL}", so it can\'t know what it is to reach: '
+            f'role_keys={{"{role}": {[*seen, DESIRED_GOAL]}}}, or sb3_gac.envs.AppendDesiredGoal around the environment.',
             stacklevel=3,
         )
 
