@@ -258,6 +258,21 @@ def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("asked", "taken"), [(2, 2), (12, 5)])
+def test_evaluations_on_the_way_have_five_episodes_at_most(asked, taken, tmp_path, monkeypatch):
+    numbers = []
+
+    class Noted(job.GuiderLearnerEvalCallback):
+        def _on_step(self):
+            numbers.append((self.n_eval_episodes, self.eval_env.num_envs))
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(job, "GuiderLearnerEvalCallback", Noted)
+    with pytest.raises((KeyboardInterrupt, SystemExit)):
+        main([*QUICK, "--episodes", str(asked), "--runs", str(tmp_path)])
+    assert numbers == [(taken, taken)]
+
+
 def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_path, monkeypatch):
     asked = []
 

@@ -34,6 +34,8 @@ from sb3_gac.training.options import algorithm_arguments
 from sb3_gac.training.progress import Progress
 
 EVALUATIONS = 10
+#: Episodes of an evaluation on the way, side by side: enough for a curve
+EPISODES_ON_THE_WAY = 5
 
 
 class Job(NamedTuple):
@@ -93,7 +95,7 @@ def open_environments(options: Namespace) -> tuple[VecEnv, VecEnv]:
     normalization = PRESETS[options.preset].normalization(options.algorithm)
     try:
         env = normalized(make_envs(*made, options.envs, options.seed), normalization)
-        return env, normalized(make_envs(*made, min(5, options.episodes)), normalization, training=False)
+        return env, normalized(make_envs(*made, min(EPISODES_ON_THE_WAY, options.episodes)), normalization, training=False)
     except (ImportError, GymnasiumError, ValueError) as error:
         raise ValueError(f"{options.env_id}: {error}") from error
 
@@ -120,7 +122,7 @@ def learn(job: Job) -> tuple[list[dict[str, float]], float]:
     options, directory, model, eval_env = job
     every = max(options.steps // EVALUATIONS // options.envs, 1)
     evaluation = _evaluation_class(model)(
-        eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=options.episodes, verbose=0
+        eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=eval_env.num_envs, verbose=0
     )
     started, before, resumed = time.time(), 0.0, model.resumed_notes is not None
     if resumed:

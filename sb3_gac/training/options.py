@@ -121,7 +121,9 @@ def _add_training(group: Any) -> None:
 
 
 def _add_results(group: Any) -> None:
-    group.add_argument("--episodes", type=positive, help=f"of each evaluation (default: {DEFAULTS['episodes']})")
+    group.add_argument(
+        "--episodes", type=positive, help=f"of the last evaluation (default: {DEFAULTS['episodes']}); those on the way have 5"
+    )
     group.add_argument(
         "--tensorboard", action="store_true", default=None, help="log for TensorBoard in the run's directory (default: no)"
     )
