@@ -25,6 +25,7 @@ from sb3_gac.checks.values import described, entries_of
 GUARD = "_environment_guard"
 TRUNCATED = "TimeLimit.truncated"  # SB3's name of an end by time limit in an info
 RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under FINAL
+ONE_AFTER_THE_OTHER = (DummyVecEnv.step_wait.__code__, DummyVecEnv.reset.__code__)
 REWARD_IS_TAKEN = (DummyVecEnv.step_wait.__code__, Monitor.step.__code__)  # by SB3, which makes a number of it
 NO_NUMBER = ("0-dimensional arrays", "size-1 arrays", "array element with a sequence", "float() argument")  # so numpy says it
 
@@ -75,6 +76,8 @@ class EnvironmentGuard:
         self._entries = entries_in(env.observation_space)
         self._base_entries = entries_in(self.base.observation_space)
         self._failure: str | None = None
+        #: Of those that DummyVecEnv steps one after the other: how many are done in the call under way
+        self._done = 0
         self._calls = 0
         self._uses_inside: list[EnvironmentUse] = []
         self._ends = SuspiciousEnds()
@@ -158,6 +161,7 @@ class EnvironmentGuard:
             if not (isinstance(value, np.ndarray) and value.shape == entry.shape and value.dtype == entry.dtype):
                 check_entries(entries, {key: entry}, index)
         self._save_obs(index, observation)
+        self._done = index + 1
 
     def close(self) -> None:
         """Processes of which one has died, or was interrupted within a message, can't be told to end: they are ended."""
@@ -208,6 +212,7 @@ class EnvironmentGuard:
     def _call(self, method: Callable[..., Any], *args: Any) -> Any:
         if self._failure is not None:
             raise EnvironmentFailedError(self._failure)
+        self._done = 0
         try:
             return method(*args)
         except FAULTS:
@@ -223,22 +228,25 @@ class EnvironmentGuard:
         if isinstance(self.base, SubprocVecEnv) and isinstance(error, (EOFError, OSError)):
             self._failure = end_processes(self.base)
             return EnvironmentFailedError(self._failure)
-        frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-        said = described(error)
-        if frames[-1].f_code in REWARD_IS_TAKEN and any(words in str(error) for words in NO_NUMBER):
-            said += " Its reward must be a single number, such as float(reward[0])."
-        for frame in frames:  # SB3's own loops know which environment they are at
-            if frame.f_locals.get("self") is self.base and "env_idx" in frame.f_locals:
-                return EnvironmentFailedError(
-                    f"Environment {frame.f_locals['env_idx']} raised {said} {KEPT} Fix the "
-                    "environment (or call set_env) and continue with learn(..., reset_num_timesteps=False)."
-                )
-            if frame.f_code.co_name == "_stack_obs":
-                for number, observation in enumerate(frame.f_locals["obs_list"]):
-                    try:
-                        check_entries(observation, self._base_entries, number)
-                    except InvalidStepError as fault:
-                        return fault
+        codes = [frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)]
+        if isinstance(self.base, DummyVecEnv) and self._done < self.base.num_envs and set(codes) & set(ONE_AFTER_THE_OTHER):
+            said = described(error)
+            if codes[-1] in REWARD_IS_TAKEN and any(words in str(error) for words in NO_NUMBER):
+                said += " Its reward must be a single number, such as float(reward[0])."
+            return EnvironmentFailedError(
+                f"Environment {self._done} raised {said} {KEPT} Fix the environment (or call set_env) and continue with "
+                "learn(..., reset_num_timesteps=False)."
+            )
+        return self._fault_in_answers() if isinstance(self.base, SubprocVecEnv) else None
+
+    def _fault_in_answers(self) -> InvalidStepError | None:
+        """Of what the processes have sent: SubprocVecEnv can't put together observations that do not fit their space."""
+        for index, pipe in enumerate(self.base.remotes):  # type: ignore[attr-defined]
+            if isinstance(pipe.answer, tuple):
+                try:
+                    check_entries(pipe.answer[0], self._base_entries, index)
+                except InvalidStepError as fault:
+                    return fault
         return None
 
 

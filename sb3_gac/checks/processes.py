@@ -29,6 +29,8 @@ class WatchedPipe:
         self._awaits_answer = False
         #: Whether a message is under way, or was when an interrupt came
         self.torn = False
+        #: To the last request; that to a step or a reset begins with the observation
+        self.answer: Any = None
         #: Steps and resets that were asked for, by whatever way
         self.uses = 0
 
@@ -42,6 +44,7 @@ class WatchedPipe:
         """
         if self._awaits_answer:
             self.recv()
+        self.answer = None
         self.uses += _is_use(request)
         self._exchange(self._pipe.send, request)
         self._awaits_answer = True
@@ -56,9 +59,9 @@ class WatchedPipe:
         while not self._pipe.poll(PATIENCE):
             if not self._process.is_alive() and not self._pipe.poll():
                 raise EOFError
-        answer = self._exchange(self._pipe.recv)
+        self.answer = self._exchange(self._pipe.recv)
         self._awaits_answer = False
-        return answer
+        return self.answer
 
     def _exchange(self, method: Callable[..., Any], *args: Any) -> Any:
         if self.torn:
