@@ -12,7 +12,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_gac.base.acting import BehaviourState
 from sb3_gac.base.arguments import ConstructorArguments, present_names
-from sb3_gac.base.compiling import AUTO
+from sb3_gac.base.compiling import AUTO, Compilation
 from sb3_gac.base.faults import FaultTolerance
 from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
 from sb3_gac.base.hooks import EpisodeHooks
@@ -39,7 +39,7 @@ from sb3_gac.replay.source import ReplaySource
 
 
 class AsymmetricAlgorithm(
-    ConstructorArguments, DeploymentGuard, ResumableAlgorithm, FaultTolerance, EpisodeHooks, GradientSteps
+    ConstructorArguments, DeploymentGuard, ResumableAlgorithm, FaultTolerance, EpisodeHooks, GradientSteps, Compilation
 ):
     """
     Base of all algorithms, beside SB3's ``OffPolicyAlgorithm`` or ``OnPolicyAlgorithm``: each ancestor adds one ability to

@@ -37,7 +37,7 @@ _EPISODE = 1_000
 ENT_COEF_BOUNDS = (1e-8, 1e4)
 
 
-class AsymmetricOffPolicyAlgorithm(OffPolicyActing):
+class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCollection):  # type: ignore[override]
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
 
@@ -296,8 +296,13 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing):
                 batch = self._sample_batch(batch_size)
                 self._resting = at_rest.union(name for name, every in update_every.items() if self._n_updates % every)
                 follow_now = targets_follow and (self._n_updates + 1) % self.target_update_interval == 0
-                step = self._update_with_targets if follow_now else self.update
-                history.append(self._compiled(step.__name__, step, batch) if self.compiles else step(batch))
+                if self.compiles:  # targets and all
+                    step = self._update_with_targets if follow_now else self.update
+                    history.append(self._compiled(step.__name__, step, batch))
+                else:
+                    history.append(self.update(batch))
+                    if follow_now:
+                        self.policy.update_targets(self.tau)
                 self._n_updates += 1
 
     def _update_with_targets(self, batch: Batch) -> Metrics:

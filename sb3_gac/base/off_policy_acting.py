@@ -1,21 +1,32 @@
 """Who takes the actions of an off-policy algorithm: chance, the behaviour policy, a frozen one, or a recording."""
 
 from copy import deepcopy
+from typing import ClassVar
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 
-from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.base.behaviour import Behaviour, BehaviourSpec
 from sb3_gac.base.collecting import DataCollection
+from sb3_gac.base.frozen import FrozenPolicy
+from sb3_gac.base.hooks import EpisodeHooks
+from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.recording import Recording
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 
 
-class OffPolicyActing(AsymmetricAlgorithm, DataCollection):  # type: ignore[override]
-    """Actions for the environments, in [-1, 1] for the buffer; each environment's policy stays to the episode's end."""
+class OffPolicyActing(EpisodeHooks, DataCollection):
+    """
+    Actions for the environments, in [-1, 1] for the buffer; each environment's policy stays to the episode's end.
 
+    The attributes without a value are those of :class:`sb3_gac.base.algorithm.AsymmetricAlgorithm`, which stands beside it.
+    """
+
+    policy_class: type[AsymmetricPolicy]
+    frozen: dict[str, FrozenPolicy]
+    frozen_arguments: ClassVar[tuple[str, ...]]
+    is_recurrent: bool
     behaviour: BehaviourSpec
     behaviour_per: str
     chooses_behaviour: Behaviour

@@ -9,9 +9,10 @@ from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
-from sb3_gac.base.compiling import AUTO, Compilation
+from sb3_gac.base.compiling import AUTO
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.divergence import check_finite_metrics
 from sb3_gac.math.losses import critic_loss, masked_mean
@@ -50,7 +51,7 @@ def _scheduled(minimize: Callable[..., Metrics]) -> Callable[..., Metrics]:
     return scheduled
 
 
-class GradientSteps(Compilation):
+class GradientSteps(BaseAlgorithm):
     """
     Gradient steps of a policy's networks and coefficients: an algorithm writes one ``update``, made of ``minimize``.
 
@@ -66,6 +67,12 @@ class GradientSteps(Compilation):
     max_grad_norm: float | None
     mixed_precision: bool
     programs: dict[Any, Program]
+    #: What :class:`sb3_gac.base.compiling.Compilation` has decided
+    compile: bool | str
+    compiles: bool
+    _compiles_on_auto: bool
+    _failed_to_compile: bool
+    _compiling_failed: Callable[[Exception], None]
     _branches_are_independent: bool
     #: Takes the steps of :attr:`AsymmetricPolicy.side_branch`, in a round in which branches run at once
     _worker: Worker | None = None

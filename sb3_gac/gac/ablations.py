@@ -4,9 +4,8 @@ from typing import Any
 
 import torch as th
 
-from sb3_gac.base.batch import Batch
+from sb3_gac.base.batch import Batch, Loss, Outputs
 from sb3_gac.gac.gac import GAC
-from sb3_gac.gac.policies import ActionDistributions
 from sb3_gac.math.losses import distillation_loss
 
 
@@ -35,8 +34,10 @@ class GACWithoutQ(GACShare):
     def _learner_can_train_a_std(self) -> bool:
         return False
 
-    def learner_objective(
-        self, batch: Batch, now: ActionDistributions, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
-    ) -> th.Tensor:
+    def learner_loss(
+        self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
+    ) -> Loss:
         """Eq. 14."""
-        return distillation_loss(now.guider.detach().kl_of_means(now.learner, self.kl_reduction), batch.mask)
+        now = self.policy.action_distributions(guider.now.detach(), learner.now)
+        kl = now.guider.detach().kl_of_means(now.learner, self.kl_reduction)
+        return self._with_deployment_losses(distillation_loss(kl, batch.mask), now, batch.mask)

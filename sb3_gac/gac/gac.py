@@ -273,31 +273,30 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
     def learner_loss(
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
     ) -> Loss:
-        """Eq. 16, and the fit of what serves at deployment alone."""
+        """Eq. 16, with the learner's critics, or the guided ones where it has none."""
         now = self.policy.action_distributions(guider.now.detach(), learner.now)
-        loss = self.learner_objective(batch, now, noise, alpha, beta)
-        fits = self.policy.learner.deployment_losses(now.deployed, now.learner, batch.mask)
-        seen = {f"learner_{name}": masked_mean(values, batch.mask) for name, values in now.learner.diagnostics().items()}
-        return Loss(loss + sum(fits.values()), {"learner_loss": loss, **fits, **seen})
-
-    def learner_objective(
-        self, batch: Batch, now: ActionDistributions, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
-    ) -> th.Tensor:
-        """
-        Eq. 16, with the learner's critics, or the guided ones where it has none.
-
-        :param now: the policies at the observations, with the learner's gradient
-        :return: scalar
-        """
         q, log_prob = now.learner.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
-        ent_coef = beta * self.learner_entropy
-        if not (self.learner_kl_weight or self.is_guided):
-            return policy_loss(q=q, log_prob=log_prob, ent_coef=ent_coef, mask=batch.mask)
-        kl = now.guider.detach().kl_of_means(now.learner, self.kl_reduction)
+        terms = {"q": q, "log_prob": log_prob, "ent_coef": beta * self.learner_entropy}
+        if self.learner_kl_weight or self.is_guided:
+            kl = now.guider.detach().kl_of_means(now.learner, self.kl_reduction)
+            terms |= {"kl": kl, "kl_coef": self._learner_kl_coef(alpha, q.detach(), batch.mask)}
+        return self._with_deployment_losses(policy_loss(**terms, mask=batch.mask), now, batch.mask)
+
+    def _learner_kl_coef(self, alpha: th.Tensor, q: th.Tensor, mask: th.Tensor | None) -> th.Tensor:
+        """Alpha times ``learner_kl_scale``, and ``guidance`` in units of the values that the learner climbs."""
         weight = self.learner_kl_weight * alpha
-        if self.is_guided:
-            weight = weight + self.guidance_tensor * masked_mean(q.detach().amin(dim=0).abs(), batch.mask)
-        return policy_loss(q=q, log_prob=log_prob, ent_coef=ent_coef, kl=kl, kl_coef=weight, mask=batch.mask)
+        return weight + self.guidance_tensor * masked_mean(q.amin(dim=0).abs(), mask) if self.is_guided else weight
+
+    def _with_deployment_losses(self, loss: th.Tensor, now: ActionDistributions, mask: th.Tensor | None) -> Loss:
+        """
+        :param loss: of the learner
+        :param now: the policies at the observations, with the learner's gradient
+        :param mask: of the batch
+        :return: the loss with the fit of what serves at deployment alone, and what is to be logged
+        """
+        fits = self.policy.learner.deployment_losses(now.deployed, now.learner, mask)
+        seen = {f"learner_{name}": masked_mean(values, mask) for name, values in now.learner.diagnostics().items()}
+        return Loss(loss + sum(fits.values()), {"learner_loss": loss, **fits, **seen})
 
     # --- coefficients -----------------------------------------------------------------------------------------------
 

@@ -175,9 +175,11 @@ class TrainedParameters:
         :param gradients: of each trained parameter
         :return: norm of those that are clipped, scalar
         """
-        norms = [th.linalg.vector_norm(gradient) for gradient in self._clipped(gradients)]
-        if not norms:
+        clipped = self._clipped(gradients)
+        if not clipped:
             return th.zeros((), device=self.everything[0].device if self.everything else None)
+        # one call of Python's instead of one for each; torch's compiler has no program for it
+        norms = list(map(th.linalg.vector_norm, clipped)) if th.compiler.is_compiling() else th._foreach_norm(clipped)
         return th.linalg.vector_norm(th.stack(norms))
 
     def _clipped(self, gradients: Sequence[th.Tensor]) -> list[th.Tensor]:

@@ -6,6 +6,7 @@ import pytest
 import torch as th
 
 from sb3_gac import GAC, GACShare, GACWithoutQ
+from sb3_gac.base.batch import Outputs
 from sb3_gac.gac.policies import ActionDistributions
 from sb3_gac.math.distributions import TanhGaussian
 from tests.gac.helpers import batch_of
@@ -50,9 +51,9 @@ def test_ablations_have_the_critics_that_they_should():
 
 
 def _learner_gradient(model, obs, kl_coef):
-    now = model.policy.distributions(obs)
-    loss = model.learner_objective(batch_of(obs), now, th.zeros(32, 1), th.tensor(kl_coef), th.tensor(1.0))
-    return th.autograd.grad(loss, model.policy.learner.head.mean.bias)[0]
+    guider, learner = (Outputs(getattr(model.policy, role).distribution(obs), None) for role in ("guider", "learner"))
+    loss = model.learner_loss(batch_of(obs), guider, learner, th.zeros(32, 1), th.tensor(kl_coef), th.tensor(1.0))
+    return th.autograd.grad(loss.metrics["learner_loss"], model.policy.learner.head.mean.bias)[0]
 
 
 @pytest.mark.parametrize("cls", [GACShare, GACWithoutQ])
@@ -72,13 +73,14 @@ def test_ablations_keep_the_pull_whatever_the_guider(cls, guider):
     th.testing.assert_close(pull.squeeze(), by_hand, rtol=1e-4, atol=1e-5)
 
 
-def test_without_q_the_learner_imitates_and_nothing_else():
+def test_without_q_the_learner_imitates_and_nothing_else(monkeypatch):
     model = small_model(cls=GACWithoutQ)
     learner = TanhGaussian(th.zeros(2, 1), th.full((2, 1), math.log(0.5)))
     guider = TanhGaussian(th.tensor([[0.2], [0.4]]), learner.log_std)
-    now = ActionDistributions(guider, learner, learner)
-    loss = model.learner_objective(batch_of({}), now, th.randn(2, 1), th.tensor(1.0), th.tensor(1.0))
-    assert loss.item() == pytest.approx(0.5 * (0.4**2 + 0.8**2) / 2)
+    monkeypatch.setattr(model.policy, "action_distributions", lambda *_: ActionDistributions(guider, learner, learner))
+    outputs = Outputs(guider, None), Outputs(learner, None)
+    loss = model.learner_loss(batch_of({}), *outputs, th.randn(2, 1), th.tensor(1.0), th.tensor(1.0))
+    assert loss.metrics["learner_loss"].item() == pytest.approx(0.5 * (0.4**2 + 0.8**2) / 2)
 
 
 def test_guidance_follows_its_schedule_and_stands_in_a_saved_model_as_it_was_given(tmp_path):
