@@ -1,4 +1,4 @@
-"""Programs that run algorithms on tasks and compare them. They meet only in files, and use public names of sb3_gac."""
+"""Programs that run algorithms on tasks and compare them. They communicate only by files, and use public names of sb3_gac."""
 
 from importlib.util import find_spec
 

@@ -1,11 +1,12 @@
 """
-Finished runs of a suite -> a tidy CSV, and scores as JSON::
+Aggregates the finished runs of a suite into a tidy CSV file, and into scores as JSON::
 
     python -m benchmarks.aggregate benchmarks/suites/halfcheetah.yml --out benchmarks/results/halfcheetah
 
-A missing run is an error, not a smaller average; ``--complete-cells`` leaves out the suite's cells of which a run is missing,
-all of their runs, and names them in the results.  ``--reuse-results`` takes runs whose directories are elsewhere, or gone,
-from the results that they were aggregated to.  Intervals are stratified bootstraps of 95% (rliable, arXiv 2108.13264).
+A missing run is an error, since an average over fewer runs would hide it.  ``--complete-cells`` leaves out all runs of the
+suite's cells in which a run is missing, and names the missing runs in the results.  ``--reuse-results`` takes runs whose
+directories are elsewhere, or gone, from the results into which they were aggregated.  Intervals are stratified bootstraps of
+95% (rliable, arXiv 2108.13264).
 """
 
 import argparse
@@ -44,13 +45,14 @@ def finished_runs(
     suite: Path, runs: Path, complete_cells: bool = False, reuse: Sequence[Path] = (), rerun: Sequence[str] = ()
 ) -> tuple[list[FinishedRun], list[str]]:
     """
-    :param suite: YAML file
+    :param suite: YAML file of the suite
     :param runs: directory of all runs
-    :param complete_cells: whether a cell of which a run is missing is left out, instead of an error
-    :param reuse: results, without a suffix, whose runs count where there is no directory; the later over the earlier ones
-    :param rerun: algorithms of which they do not
-    :return: the runs to count, and the names of those that are missing
-    :raises FileNotFoundError: naming the runs that are not finished
+    :param complete_cells: whether a cell in which a run is missing is left out; otherwise a missing run is an error
+    :param reuse: paths of results, without a suffix, whose runs count where a run has no directory; where two have the same
+        run, the later path counts
+    :param rerun: names of the algorithms whose runs in ``reuse`` do not count
+    :return: records of the runs to count, and names of the runs that are missing
+    :raises FileNotFoundError: naming the runs that are not finished, if they may not be left out or no cell is complete
     :raises ValueError: if a run was made with other settings
     """
     cells = read_cells(suite)
@@ -67,9 +69,10 @@ def finished_runs(
 
 def collect(runs: list[FinishedRun]) -> pd.DataFrame:
     """
-    :param runs: finished
-    :return: one row per evaluation: task, noise, algorithm, seed, timesteps, learner, and guider, kl, ... where there are;
-        ``needed_steps``, if a run needs others, are those of the runs that came before, and not among its timesteps
+    :param runs: records of finished runs
+    :return: table with one row for each evaluation: task, noise, algorithm, seed, timesteps, learner, and where they exist
+        guider, kl and others; where a run needs other runs, ``needed_steps`` has their environment steps, which ``timesteps``
+        does not contain
     """
     before = {run.name: needed_steps(run.spec) for run in runs}
     of_needed = {name: {NEEDED: steps} if any(before.values()) else {} for name, steps in before.items()}
@@ -80,8 +83,9 @@ def collect(runs: list[FinishedRun]) -> pd.DataFrame:
 
 def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
     """
-    :param tidy: see :func:`collect`
-    :return: one row per run: final return, mean return over all evaluations (the area under the curve, over its length)
+    :param tidy: evaluations, see :func:`collect`
+    :return: table with one row for each run: "final", the mean return of the last evaluation, and "area", the mean return over
+        all evaluations, which is the area under the curve divided by its length
     """
     by_run = tidy.sort_values("timesteps", kind="stable").groupby(NAMES, sort=False)
     return by_run.learner.agg(final="last", area="mean").reset_index()
@@ -89,9 +93,10 @@ def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
 
 def choose_reference(algorithms: list[str], wanted: str | None = None) -> str:
     """
-    :param algorithms: that there are
-    :param wanted: one of them, ``None`` for ``REFERENCE`` if it is there, else the first
-    :raises ValueError: if the one that is wanted is not there
+    :param algorithms: names of all algorithms
+    :param wanted: name of the reference, ``None`` for ``REFERENCE`` if it is among the algorithms, and otherwise the first
+    :return: name of the reference
+    :raises ValueError: if the wanted reference is not among the algorithms
     """
     if wanted is None:
         return REFERENCE if REFERENCE in algorithms else algorithms[0]
@@ -102,9 +107,10 @@ def choose_reference(algorithms: list[str], wanted: str | None = None) -> str:
 
 def summarise_cells(tidy: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
     """
-    :param tidy: see :func:`collect`
-    :param reference: algorithm whose final mean return in the cell is what "steps_to_reference" are counted to
-    :return: per task, noise and algorithm: scores with intervals, and how far KL strayed from its target where there is one
+    :param tidy: evaluations, see :func:`collect`
+    :param reference: name of the algorithm whose final mean return in a cell is the threshold of "steps_to_reference"
+    :return: one row for each task, noise and algorithm: scores with intervals, and where there is a target for the KL, the KL
+        as multiples of it
     """
     rows = []
     for cell_key, cell in tidy.groupby(CELL, sort=False):
@@ -136,18 +142,18 @@ def _named(cell_key: Any) -> dict[str, Any]:
 
 def steps_before(group: pd.DataFrame) -> int:
     """
-    :param group: one algorithm in one cell
-    :return: environment steps of the runs that one of its runs needs
+    :param group: evaluations of one algorithm in one cell
+    :return: environment steps of the runs that one run of the algorithm needs
     """
     return int(group[NEEDED].max()) if NEEDED in group else 0
 
 
 def steps_to(group: pd.DataFrame, threshold: float) -> int | None:
     """
-    :param group: one algorithm in one cell
-    :param threshold: a return
-    :return: environment steps, with those of needed runs, at the first evaluation where the mean over seeds reaches it,
-        ``None`` if none does
+    :param group: evaluations of one algorithm in one cell
+    :param threshold: return to reach
+    :return: environment steps, those of needed runs included, at the first evaluation whose mean over seeds reaches the
+        threshold; ``None`` if no evaluation reaches it
     """
     mean = group.groupby("timesteps").learner.mean()
     reached = mean.index[mean >= threshold]
@@ -156,16 +162,16 @@ def steps_to(group: pd.DataFrame, threshold: float) -> int | None:
 
 def guidance(group: pd.DataFrame) -> dict[str, float]:
     """
-    :param group: one algorithm in one cell
-    :return: the guider's final return, and KL over its target from ``STEADY_FROM`` steps on, if there are; nothing without
-        a guider. A row's KL is the mean since the evaluation before
+    :param group: evaluations of one algorithm in one cell
+    :return: mean final return of the guider, and the least, mean and largest ratio of the KL to its target after
+        ``STEADY_FROM`` steps, if there are any; empty without a guider. An evaluation's KL is the mean since the one before
     """
     if "guider" not in group or group.guider.isna().all():
         return {}
     final = group[group.timesteps == group.timesteps.max()]
     steady = group[group.timesteps > STEADY_FROM].reindex(
         columns=["kl", "target_kl"]
-    )  # nobody has them before a gradient step
+    )  # before the first gradient step no algorithm has these columns
     ratio = (steady.kl / steady.target_kl).dropna()
     kl = {f"kl_over_target_{name}": round(float(getattr(ratio, name)()), 3) for name in ("min", "mean", "max") if len(ratio)}
     return {"guider_mean": round(float(final.guider.mean()), 1), **kl}
@@ -173,29 +179,31 @@ def guidance(group: pd.DataFrame) -> dict[str, float]:
 
 def normalised_scores(tidy: pd.DataFrame) -> pd.DataFrame:
     """
-    Returns of a cell between the lowest point of its curves and its best end, whatever their sign: a constant added to all of
-    them, or a positive factor, changes nothing.
+    Normalise the returns of each cell, from the lowest point of its curves to its best end. A constant that is added to all
+    returns, or a positive factor, changes nothing.
 
-    :param tidy: see :func:`collect`
-    :return: :func:`run_scores` with "low", the lowest mean over seeds of any algorithm at any evaluation in the cell, "high",
-        the best algorithm's mean final return there, and "normalised", the final return with the two at 0 and 1
+    :param tidy: evaluations, see :func:`collect`
+    :return: table of :func:`run_scores` with three more columns: "low", the lowest mean over seeds of any algorithm at any
+        evaluation in the cell; "high", the best algorithm's mean final return in the cell; and "normalised", the final return
+        on a scale with "low" at 0 and "high" at 1
     """
     scores = run_scores(tidy)
     low = tidy.groupby([*CELL, "algorithm", "timesteps"]).learner.mean().groupby(CELL).min()
     high = scores.groupby([*CELL, "algorithm"]).final.mean().groupby(CELL).max()
     scores = scores.merge(pd.DataFrame({"low": low, "high": high}).reset_index(), on=CELL)
-    span = (scores.high - scores.low).replace(0.0, 1.0)  # where nobody ever differs, all are the best
+    span = (scores.high - scores.low).replace(0.0, 1.0)  # where no returns differ, all algorithms are the best
     return scores.assign(normalised=1 - (scores.high - scores.final) / span)
 
 
 def compare(tidy: pd.DataFrame) -> dict[str, Any]:
     """
-    Over all cells together, for the algorithms that every cell has, with equally many runs of each: as many as there are where
-    there are fewest, those with the first seeds.
+    Compare over all cells together the algorithms that every cell has. All of them count with equally many runs in every cell:
+    the smallest number of runs of any algorithm in any cell, those with the first seeds.
 
-    :param tidy: see :func:`collect`
-    :return: "compared", which says what was; interquartile means of normalised final returns, and each algorithm's
-        probability of improvement over each other, with intervals
+    :param tidy: evaluations, see :func:`collect`
+    :return: "compared", the algorithms, cells and seeds that were compared; "normalised_iqm", interquartile means of the
+        normalised final returns; and "probability_of_improvement" of each algorithm over each other. The last two have
+        intervals
     """
     scores = normalised_scores(tidy)
     counts = scores.pivot_table("seed", CELL, "algorithm", aggfunc="count")
@@ -220,7 +228,7 @@ def _runs_by_cell(of_algorithm: pd.DataFrame) -> np.ndarray:
 
 
 def _compared_cells(compared: pd.DataFrame) -> list[dict[str, Any]]:
-    """Each cell's seeds by algorithm, and the returns that count as 0 and 1."""
+    """For each cell, the seeds of each algorithm, and the returns that are normalised to 0 and 1."""
     return [
         {
             **_named(key),
@@ -238,8 +246,8 @@ def _rounded(estimates: dict[str, Estimate]) -> dict[str, list[float]]:
 
 def command(options: argparse.Namespace) -> str:
     """
-    :param options: of this program
-    :return: what makes the runs, or those that are not there, and then these results again, in a shell in the checkout
+    :param options: command-line options of this program
+    :return: shell command that makes the missing runs and then the same results, in the checkout
     """
     shared = [_from_checkout(options.suite), *_option("--runs", [options.runs] if options.runs != RUNS else [])]
     shared += [*_option("--reuse-results", options.reuse_results), *_option("--rerun", options.rerun)]
@@ -260,7 +268,10 @@ def _from_checkout(path: Path) -> str:
 
 
 def origins(runs: list[FinishedRun]) -> dict[str, Any]:
-    """Commits and versions of the runs, their settings and arguments, and the hours that they took."""
+    """
+    :param runs: records of finished runs
+    :return: commits and versions of the runs, their settings and arguments, and the hours that they took
+    """
     made_with = _distinct([origin for run in runs for origin in run.origins])
     seconds = [run.seconds for run in runs if run.seconds is not None]
     particulars = {kind_of(run.spec): found for run in runs if (found := particulars_of(run.spec))}
@@ -287,9 +298,9 @@ def _distinct(origins_of_runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """
-    Command line.
+    Entry point of the command line.
 
-    :param arguments: by default the process's
+    :param arguments: command-line arguments, by default those of the process
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suite", type=Path)
@@ -304,7 +315,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     table = collect(runs).replace({"noise": {NO_NOISE: np.nan}})
     table.to_csv(evaluations, index=False, float_format="%.6g")
-    tidy = read_tidy(evaluations)  # so that the scores follow from the file to the last digit
+    tidy = read_tidy(evaluations)  # so that the scores can be computed from the file to the last digit
     reference = choose_reference(list(tidy.algorithm.unique()), options.reference)
     results = {
         "command": command(options),

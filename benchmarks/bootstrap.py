@@ -10,14 +10,14 @@ from rliable import library as rly
 from rliable import metrics
 
 REPETITIONS = 2_000
-#: A value, and the ends of its interval
+#: A value, and the two ends of its interval
 Estimate = tuple[float, tuple[float, float]]
 Name = TypeVar("Name", bound=Hashable)
 
 
 @contextmanager
 def _from_one_seed() -> Iterator[None]:
-    """Whatever numpy's global generator has drawn before, and without a trace in it."""
+    """Seed numpy's global generator as long as the context lasts, and restore its state afterwards."""
     state = np.random.get_state()
     np.random.seed(0)
     try:
@@ -28,11 +28,12 @@ def _from_one_seed() -> Iterator[None]:
 
 def estimate(scores: dict[Name, Any], metric: Callable[..., float]) -> dict[Name, Estimate]:
     """
-    The same for the same scores: what rliable draws from numpy's global generator starts from one seed.
+    Estimate a metric with its bootstrap interval. The random numbers start from a fixed seed, so that the same scores give the
+    same interval.
 
-    :param scores: name -> scores of shape (runs, cells), or what else the metric takes
-    :param metric: of rliable's
-    :return: name -> its value and interval
+    :param scores: name -> arguments of the metric: scores of shape (runs, cells), or a tuple of such arrays
+    :param metric: one of rliable's metrics
+    :return: name -> value of the metric, and its interval
     """
     if not scores:
         return {}
@@ -47,8 +48,8 @@ def estimate(scores: dict[Name, Any], metric: Callable[..., float]) -> dict[Name
 
 def interval(scores: np.ndarray) -> list[float]:
     """
-    :param scores: one per run
-    :return: interquartile mean, and the ends of its interval
+    :param scores: one score for each run, shape (N,)
+    :return: interquartile mean of the scores, and the two ends of its interval
     """
     point, (low, high) = estimate({"one": scores[:, None]}, metrics.aggregate_iqm)["one"]
     return [round(value, 1) for value in (point, low, high)]
@@ -56,10 +57,12 @@ def interval(scores: np.ndarray) -> list[float]:
 
 def improvements(matrices: dict[str, np.ndarray]) -> dict[str, Estimate]:
     """
-    Each pair is drawn once: the other way round is the complement.
+    Estimate the probability of improvement of each algorithm over each other. The bootstrap is drawn once for each pair, since
+    the probability in the other direction is the complement.
 
-    :param matrices: algorithm -> scores of shape (runs, cells)
-    :return: "one over other" -> probability that a run of the one scores more than one of the other
+    :param matrices: algorithm -> scores, shape (runs, cells)
+    :return: "one over other" -> probability that a run of the one algorithm scores more than a run of the other, with its
+        interval
     """
     pairs = {(one, other): (matrices[one], matrices[other]) for one, other in combinations(matrices, 2)}
     estimates = estimate(pairs, metrics.probability_of_improvement)
@@ -74,9 +77,9 @@ def _complement(drawn: Estimate) -> Estimate:
 
 def profile(scores: dict[str, np.ndarray], thresholds: np.ndarray) -> dict[str, np.ndarray]:
     """
-    :param scores: algorithm -> one by run, of all cells together
-    :param thresholds: scores, shape (T,)
-    :return: algorithm -> the share of its runs above each threshold, and the ends of its interval, shape (3, T)
+    :param scores: algorithm -> one score for each run, of all cells together
+    :param thresholds: scores to compare with, shape (T,)
+    :return: algorithm -> share of its runs above each threshold, and the two ends of the share's interval, shape (3, T)
     """
     matrices = {name: of_runs[:, None] for name, of_runs in scores.items()}
     with _from_one_seed():

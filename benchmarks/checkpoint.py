@@ -1,4 +1,4 @@
-"""A run's state on disk: written in one move, taken up again after whatever ended the process."""
+"""A run's state on disk: written in one move, so that a run can go on however its process ended."""
 
 import fcntl
 import json
@@ -17,14 +17,16 @@ from sb3_gac import ExactCheckpointCallback, SeededEvalCallback
 from sb3_gac.checkpoint.files import checkpoints
 
 CHECKPOINT, TIMING = "checkpoint", "timing.json"
-#: A model and its evaluations so far
+#: A model, and one row for each of its evaluations so far
 Resumed: TypeAlias = tuple[BaseAlgorithm, list[dict[str, float]]]
 
 
 def write_atomically(path: Path, text: str) -> None:
     """
-    :param path: which has the whole text or is what it was before, whenever the process ends
-    :param text: to write
+    Write a file in one move: whenever the process ends, the file has the whole text or is unchanged.
+
+    :param path: file to write
+    :param text: content of the file
     """
     temporary = path.with_name(f"{path.name}.tmp")
     with temporary.open("w") as file:
@@ -36,18 +38,18 @@ def write_atomically(path: Path, text: str) -> None:
 
 def read_seconds(path: Path) -> float:
     """
-    :param path: of a run's ``timing.json``
-    :return: seconds that the run has taken so far
+    :param path: path of a run's ``timing.json``
+    :return: seconds from the run's start to its last evaluation, 0 if there is no file
     """
     return float(json.loads(path.read_text())["seconds"]) if path.exists() else 0.0
 
 
 def write_timing(path: Path, seconds: float, steps: int, learner: float) -> None:
     """
-    :param path: of a run's ``timing.json``
-    :param seconds: from the run's start to its last evaluation
-    :param steps: of the environments up to then
-    :param learner: return there
+    :param path: path of a run's ``timing.json``
+    :param seconds: seconds from the run's start to its last evaluation
+    :param steps: environment steps at that evaluation
+    :param learner: mean return of the learner at that evaluation
     """
     write_atomically(path, json.dumps({"seconds": seconds, "steps": steps, "learner": learner}))
 
@@ -55,8 +57,10 @@ def write_timing(path: Path, seconds: float, steps: int, learner: float) -> None
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
     """
-    :param directory: of a run, for as long as the context lasts this process's alone
-    :raises RuntimeError: if another process has it
+    Keep a run's directory for this process alone, as long as the context lasts.
+
+    :param directory: directory of the run
+    :raises RuntimeError: if another process is making the run
     """
     with (directory / "lock").open("w") as file:
         try:
@@ -68,10 +72,10 @@ def locked(directory: Path) -> Iterator[None]:
 
 class ExactCheckpoints:
     """
-    Of a run of this package's algorithms, one after every evaluation: what goes on from the last one ends where the run would
-    have ended without an interruption, to the bit if its environments can be put back to where they were.
+    The checkpoints of a run of one of this package's algorithms, one after every evaluation. A run that goes on from the last
+    one ends as it would have without the interruption, to the bit if the state of its environments can be restored.
 
-    :param directory: of the run
+    :param directory: directory of the run
     """
 
     def __init__(self, directory: Path):
@@ -79,11 +83,11 @@ class ExactCheckpoints:
 
     def resume(self, algorithm_class: Any, arguments: dict[str, Any], env: VecEnv, seed: int) -> Resumed | None:
         """
-        :param algorithm_class: of the model
-        :param arguments: that it was made with
-        :param env: made as before
-        :param seed: of the run
-        :return: model and evaluations so far; ``None`` if there is no checkpoint
+        :param algorithm_class: class of the algorithm
+        :param arguments: arguments that the model was made with
+        :param env: environments of the run, made as before
+        :param seed: seed of the run
+        :return: model, and its evaluations so far; ``None`` if there is no checkpoint
         """
         if not checkpoints(self._directory):
             return None
@@ -92,22 +96,26 @@ class ExactCheckpoints:
 
     def callback(self, evaluation: SeededEvalCallback, every: int) -> BaseCallback:
         """
-        :param evaluation: called before what is returned
-        :param every: steps between two evaluations
+        :param evaluation: callback that evaluates; it is called before the one that is returned
+        :param every: environment steps between two evaluations
+        :return: callback that writes a checkpoint after every evaluation
         """
-        # Told to end, a run ends at once: a checkpoint between evaluations would shift those to come
+        # A run that is told to end writes no checkpoint: one between two evaluations would shift the next evaluations
         return ExactCheckpointCallback(self._directory, every, notes=lambda: _plain(evaluation.history), on_signals=False)
 
     def remove(self) -> None:
-        """Once the run is finished."""
+        """Remove all checkpoints, once the run is finished."""
         shutil.rmtree(self._directory, ignore_errors=True)
 
 
 class SB3Checkpoints(ExactCheckpoints):
-    """Of a run of SB3's own algorithms: model and replay buffer; what goes on starts new episodes, and random numbers anew."""
+    """
+    The checkpoints of a run of one of SB3's own algorithms: model and replay buffer. A run that goes on from one starts new
+    episodes, with another seed.
+    """
 
     def resume(self, algorithm_class: Any, arguments: dict[str, Any], env: VecEnv, seed: int) -> Resumed | None:
-        """See :meth:`ExactCheckpoints.resume`; the same checkpoint always goes on in the same way."""
+        """See :meth:`ExactCheckpoints.resume`; the new seed follows from the run's seed and steps alone."""
         for path in (self._directory, self._with(".old")):
             if path.exists():
                 model = algorithm_class.load(path / "model", env=env, device="cpu")
@@ -144,8 +152,10 @@ class SB3Checkpoints(ExactCheckpoints):
 
 class _AfterEvaluation(BaseCallback):
     """
-    :param evaluation: called before this one
-    :param save: of model and evaluations so far
+    Saves the model after every evaluation.
+
+    :param evaluation: callback that evaluates; it is called before this one
+    :param save: function that saves the model and its evaluations so far
     """
 
     def __init__(self, evaluation: SeededEvalCallback, save: Callable[[Any, list[dict[str, float]]], None]):
@@ -164,7 +174,8 @@ def _plain(history: list[dict[str, float]]) -> list[dict[str, float]]:
 
 def checkpoints_of(algorithm_class: type, directory: Path) -> ExactCheckpoints:
     """
-    :param algorithm_class: of a run
-    :param directory: of the run
+    :param algorithm_class: class of a run's algorithm
+    :param directory: directory of the run
+    :return: the run's checkpoints, of the kind that the algorithm has
     """
     return (ExactCheckpoints if hasattr(algorithm_class, "save_checkpoint") else SB3Checkpoints)(directory)

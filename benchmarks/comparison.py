@@ -1,4 +1,4 @@
-"""A comparison on one task: a suite that follows from command-line options, its runs, and a page; :mod:`sb3_gac.compare`."""
+"""The program behind :mod:`sb3_gac.compare`: it makes a suite of one task from its options, the suite's runs, and a page."""
 
 import argparse
 import json
@@ -36,8 +36,9 @@ _OF_TASKS = {"noise_std", "history"}
 
 def parse_arguments(description: str | None, arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """
-    :param description: of the program
-    :param arguments: command line, by default the process's
+    :param description: text that ``--help`` shows above the options
+    :param arguments: command-line arguments, by default those of the process
+    :return: options of the comparison
     """
     parser = argparse.ArgumentParser(
         prog="python -m sb3_gac.compare", description=description, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -78,8 +79,8 @@ def parse_arguments(description: str | None, arguments: Sequence[str] | None = N
 
 def suite_of_options(options: argparse.Namespace) -> dict[str, Any]:
     """
-    :param options: see :func:`parse_arguments`
-    :return: the suite, as YAML has it
+    :param options: options of the comparison, see :func:`parse_arguments`
+    :return: content of the suite's YAML file
     """
     runs = {"algorithms": list(options.algorithms), "seeds": list(range(options.seeds))}
     cell = _registered(options) or _own(options)
@@ -101,7 +102,7 @@ def suite_of_options(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _registered(options: argparse.Namespace) -> dict[str, Any] | None:
-    """A cell of one of this package's tasks, with its preset's settings, if it is one with no other arguments."""
+    """The cell of a registered task; ``None`` for any other environment, or one with wrappers or other arguments."""
     suite = suite_of(options.env)
     if suite is None or options.wrappers or set(options.env_kwargs) - _OF_TASKS:
         return None
@@ -123,8 +124,8 @@ def _preset_for(env_id: str) -> str:
 
 def write_suite(options: argparse.Namespace) -> Path:
     """
-    :param options: see :func:`parse_arguments`
-    :return: the suite's file
+    :param options: options of the comparison, see :func:`parse_arguments`
+    :return: path of the suite's file
     """
     options.out.mkdir(parents=True, exist_ok=True)
     path: Path = options.out / "suite.yml"
@@ -134,8 +135,8 @@ def write_suite(options: argparse.Namespace) -> Path:
 
 def command(options: argparse.Namespace) -> str:
     """
-    :param options: see :func:`parse_arguments`
-    :return: what makes the same comparison again
+    :param options: options of the comparison, see :func:`parse_arguments`
+    :return: shell command that makes the same comparison again
     """
     given = {
         "--env": [options.env],
@@ -158,14 +159,15 @@ def _flow(values: Mapping[str, Any]) -> str:
 
 def run(options: argparse.Namespace) -> Path:
     """
-    Train what is left, and make the page.
+    Make the runs that are left, and the page.
 
-    :param options: see :func:`parse_arguments`
-    :return: the page
-    :raises ValueError: if the environment, an algorithm or an argument is wrong; before the first run
+    :param options: options of the comparison, see :func:`parse_arguments`
+    :return: path of the page
+    :raises ValueError: before the first run, if the environment, an algorithm or an argument is wrong; after the last one, if
+        a run failed
     """
     suite, runs = write_suite(options), options.out / "runs"
-    # Processes of runs begin elsewhere, and must find modules that are found here
+    # The processes of runs start in another folder, and must find the modules that this one finds
     os.environ["PYTHONPATH"] = os.pathsep.join([os.getcwd(), *filter(None, [os.environ.get("PYTHONPATH")])])
     jobs, finished = launch.jobs_left(suite, runs)
     check_programs(job.spec for job in jobs)
@@ -182,7 +184,7 @@ def run(options: argparse.Namespace) -> Path:
 
 
 def _check_goals(spec: RunSpec) -> None:
-    """Goals as entries of their own are for ``HerReplayBuffer``, and no algorithm here reads them."""
+    """Refuse goals as entries of their own: these are for ``HerReplayBuffer``, and no algorithm of a comparison reads them."""
     env = make_envs(spec, 1)
     entries = getattr(env.observation_space, "spaces", {})
     env.close()
@@ -196,10 +198,12 @@ def _check_goals(spec: RunSpec) -> None:
 
 def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
     """
-    :param options: see :func:`parse_arguments`
-    :param suite: its file
-    :param runs: directory of the runs, which are finished
-    :return: the page
+    Aggregate finished runs, write the page, and print its conclusions.
+
+    :param options: options of the comparison, see :func:`parse_arguments`
+    :param suite: path of the suite's file
+    :param runs: directory of the finished runs
+    :return: path of the page
     """
     results = options.out / "results"
     aggregate.main([str(suite), "--runs", str(runs), "--out", str(results)])
@@ -213,9 +217,9 @@ def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
 
 def random_returns(spec: RunSpec, path: Path) -> np.ndarray:
     """
-    :param spec: of a run
-    :param path: file where they are, or are put
-    :return: returns of episodes with actions at random, on the environments of evaluations
+    :param spec: settings of a run
+    :param path: JSON file from which the returns are read; if there is none, the episodes are run and the file is written
+    :return: returns of episodes with random actions, on the environments of evaluations, shape (N,)
     """
     if not path.exists():
         env = make_envs(spec, spec.eval_episodes)
@@ -228,9 +232,9 @@ def random_returns(spec: RunSpec, path: Path) -> np.ndarray:
 
 def main(description: str | None = None) -> None:
     """
-    Command line.
+    Entry point of the command line.
 
-    :param description: of the program
+    :param description: text that ``--help`` shows above the options
     """
     options = parse_arguments(description)
     try:

@@ -1,4 +1,4 @@
-"""The page of a comparison: what to train with, in words, above what it was concluded from."""
+"""The page of a comparison: a recommendation in words, above the returns and differences that it follows from."""
 
 import html
 import json
@@ -44,11 +44,11 @@ _HEADROOM = (
 def page(tidy: pd.DataFrame, found: Worth, command: str, results: Path, steps: int) -> str:
     """
     :param tidy: evaluations of the task
-    :param found: what was concluded from them
-    :param command: that makes them again
+    :param found: conclusions from the evaluations
+    :param command: shell command that makes the comparison again
     :param results: JSON file of the aggregated results
-    :param steps: of each run
-    :return: HTML that needs nothing else
+    :param steps: environment steps of each run
+    :return: HTML of the page, which needs no other file
     """
     task = title_of(str(tidy.task.iloc[0]), float(tidy.noise.iloc[0]))
     verdict = "".join(f"<p>{html.escape(text)}</p>" for text in recommendation(found, steps))

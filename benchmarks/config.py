@@ -1,8 +1,9 @@
 """
-What a run trains with: layers of YAML, the later over the earlier, checked against the algorithm's own signature.
+The arguments of a run's algorithm: layers of YAML, later ones over earlier ones, checked against the algorithm's signature.
 
-In order: the preset's arguments, those of the task, those of the task at that noise (each first for ``all`` algorithms, then
-for the families and classes from which the algorithm descends), the suite's overrides, the algorithm's own.
+The layers are, in their order: the preset's arguments, its arguments for the task, those for the task at that noise (each
+first for ``all`` algorithms, then for the families and classes from which the algorithm descends), the suite's overrides,
+and the algorithm's own arguments.
 """
 
 import warnings
@@ -29,9 +30,9 @@ _GIVEN_TO_POLICIES = {"observation_space", "action_space", "lr_schedule"}
 
 def read_algorithm(name: str, definition: Mapping[str, Any] | None = None) -> tuple[type, dict[str, Any]]:
     """
-    :param name: of an algorithm
-    :param definition: of it, ``None`` for that in ``hyperparams/algorithms.yml``
-    :return: its class, and its arguments
+    :param name: name of an algorithm
+    :param definition: definition of the algorithm, ``None`` for the one in ``hyperparams/algorithms.yml``
+    :return: class of the algorithm, and the arguments of its definition
     :raises ValueError: if there is no such algorithm or class
     """
     if definition is None:
@@ -49,10 +50,10 @@ def read_algorithm(name: str, definition: Mapping[str, Any] | None = None) -> tu
 
 def normalization(spec: RunSpec) -> dict[str, Any] | None:
     """
-    :param spec: of a run
-    :return: keyword arguments of the ``VecNormalize`` around its environments, ``normalize`` in the algorithm's definition, or
-        what its preset has for it; ``None`` if there is none
-    :raises ValueError: if they are no mapping
+    :param spec: settings of a run
+    :return: keyword arguments of the ``VecNormalize`` around its environments: ``normalize`` of the algorithm's definition, or
+        those that the preset has for the algorithm; ``None`` if nothing is normalised
+    :raises ValueError: if ``normalize`` is no mapping
     """
     definition = read_definitions()[spec.algorithm] if spec.definition is None else spec.definition
     kind, _ = read_algorithm(spec.algorithm, spec.definition)
@@ -64,13 +65,13 @@ def normalization(spec: RunSpec) -> dict[str, Any] | None:
 
 def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
     """
-    Whether runs can be made, as far as can be told at once. Each algorithm is made with its arguments, and environments that
-    are no registered tasks are tried out.
+    Check before the first run that the runs can be made, as far as this can be told without training. Each algorithm is made
+    once with its arguments, and environments that are no registered tasks are tried out.
 
-    :param where: the suite, for the message
-    :param specs: the settings of its runs
-    :raises ValueError: naming an algorithm, a task or an argument that there is not, a number that YAML reads as text, or what
-        an algorithm says of an argument or an environment
+    :param where: name of the suite, with which an error message begins
+    :param specs: settings of the suite's runs
+    :raises ValueError: naming an algorithm, a task or an argument that does not exist, or a number that YAML reads as text, or
+        with the error that an algorithm raises about an argument or an environment
     """
     kinds = {(spec.algorithm, spec.cell): spec for spec in with_needed(specs)}
     for spec in kinds.values():
@@ -87,7 +88,7 @@ def check_runs(where: str, specs: Iterable[RunSpec]) -> None:
 
 
 def _check_values(where: str, specs: Iterable[RunSpec]) -> None:
-    """Make an algorithm of each class and set of arguments on one of the registered tasks that it is to train on."""
+    """Make one algorithm for each class and set of arguments, on one of the registered tasks that it is to train on."""
     made: set[tuple[type, str]] = set()
     for spec in specs:
         kind, arguments = resolve(spec)
@@ -97,7 +98,7 @@ def _check_values(where: str, specs: Iterable[RunSpec]) -> None:
         made.add((kind, repr(arguments)))
         try:
             env = normalized(make_envs(spec, 1, spec.seed), normalization(spec))
-        except Exception:  # such as a missing simulator, which a dry run need not have
+        except Exception:  # a simulator may be missing, which a dry run does not need
             continue
         try:
             make_small(kind, arguments, env, spec.seed)
@@ -110,9 +111,9 @@ def _check_values(where: str, specs: Iterable[RunSpec]) -> None:
 
 def can_be_made(spec: RunSpec, kind: type) -> bool:
     """
-    :param spec: the settings of a run
-    :param kind: class of its algorithm
-    :return: whether the algorithm can be made before any run, without another run's model, in this process
+    :param spec: settings of a run
+    :param kind: class of the run's algorithm
+    :return: whether the algorithm can be made in this process and without another run's model, so before any run
     """
     return spec.needs is None and not issubclass(kind, Program)
 
@@ -120,15 +121,15 @@ def can_be_made(spec: RunSpec, kind: type) -> bool:
 def make_small(kind: type, arguments: Mapping[str, Any], env: VecEnv, seed: int) -> Any:
     """
     :param kind: class of an algorithm
-    :param arguments: as YAML has them
-    :param env: to train on
-    :param seed: of the algorithm
-    :return: a model that needs little memory, and takes no gradient step in its first thousands of steps
+    :param arguments: arguments of the algorithm, as YAML has them
+    :param env: environment to train on
+    :param seed: seed of the algorithm
+    :return: model that needs little memory; an off-policy one takes no gradient step
     """
     small = {"buffer_size": 1_000, "learning_starts": 10**9, "n_epochs": 1}
     known = constructor_parameters(kind)
     given = {name: arguments.get(name, value) for name, value in small.items() if name in known}
-    small = {name: small[name] for name, value in given.items() if _is_count(value)}  # others are the algorithm's to refuse
+    small = {name: small[name] for name, value in given.items() if _is_count(value)}  # the algorithm refuses others
     return kind(env=env, device="cpu", **{"policy": POLICY, **instantiate({**arguments, **small}), "seed": seed})
 
 
@@ -138,10 +139,10 @@ def _is_count(value: Any) -> bool:
 
 def check_programs(specs: Iterable[RunSpec]) -> None:
     """
-    Whether the programs that train outside of this process have the packages that they need.
+    Check that the programs that train outside of this process have the packages that they need.
 
-    :param specs: of runs
-    :raises ValueError: naming what is missing, and where
+    :param specs: settings of runs
+    :raises ValueError: naming the packages that are missing, and the interpreter that lacks them
     """
     for name, spec in {spec.algorithm: spec for spec in specs}.items():
         kind, arguments = resolve(spec)
@@ -154,9 +155,9 @@ def check_programs(specs: Iterable[RunSpec]) -> None:
 
 def check_simulators(specs: Iterable[RunSpec]) -> None:
     """
-    Whether the simulators of registered tasks are installed.
+    Check that the simulators of registered tasks are installed.
 
-    :param specs: the runs' settings
+    :param specs: settings of runs
     :raises ValueError: naming a task whose simulator is missing, and how to install it
     """
     for spec in {spec.task: spec for spec in specs if spec.environment is None}.values():
@@ -167,11 +168,11 @@ def check_simulators(specs: Iterable[RunSpec]) -> None:
 
 def try_out(where: str, spec: RunSpec) -> None:
     """
-    Make a run's environment, and on it, unless it needs another run first, its algorithm, which takes one step.
+    Make a run's environment and its algorithm, and take one step. An algorithm that needs another run's model is not made.
 
-    :param where: the suite, for the message
-    :param spec: of a run
-    :raises ValueError: with what went wrong
+    :param where: name of the suite, with which an error message begins
+    :param spec: settings of a run
+    :raises ValueError: with the type and the message of whatever error occurred
     """
     try:
         env = normalized(make_envs(spec, min(spec.envs, 2), spec.seed), normalization(spec))
@@ -189,8 +190,8 @@ def try_out(where: str, spec: RunSpec) -> None:
 
 def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
     """
-    :param spec: of a run
-    :return: class of the algorithm, and its arguments, as YAML has them; a program's are those of its definition alone
+    :param spec: settings of a run
+    :return: class of the algorithm, and its arguments as YAML has them; those of a program are its definition's alone
     :raises ValueError: if an argument is unknown to the class or its policy, or is a number that YAML reads as text
     """
     kind, own = read_algorithm(spec.algorithm, spec.definition)
@@ -230,22 +231,22 @@ def _of_program(spec: RunSpec, kind: type[Program], own: dict[str, Any]) -> dict
 
 
 def _present(where: str, kind: type, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments by their present names; which of them had former ones is said."""
+    """Arguments by their present names; a warning names those that were given by a former one."""
     try:
         present = present_names(kind, given, None)
     except TypeError as error:
         raise ValueError(f"{where}: {error}") from None
     for former in sorted(set(given) - set(present)):
         (now,) = present_names(kind, {former: None}, None)
-        warnings.warn(f'{where}: "{former}" is "{now}" now.', FutureWarning, stacklevel=3)  # whoever writes a suite sees it
+        warnings.warn(f'{where}: "{former}" is "{now}" now.', FutureWarning, stacklevel=3)  # a suite's author sees it
     return present
 
 
 def in_present_names(kind: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """
     :param kind: class of an algorithm
-    :param arguments: of it, as they were recorded
-    :return: the same, those of its policy included, by the names that they have now
+    :param arguments: arguments of the algorithm, as they were recorded
+    :return: the same arguments, those of the policy included, by their present names
     """
     present = present_names(kind, arguments, None)
     policy_class = kind.policy_aliases.get(present.get("policy", POLICY))  # type: ignore[attr-defined]
@@ -257,8 +258,8 @@ def in_present_names(kind: type, arguments: Mapping[str, Any]) -> dict[str, Any]
 def settings_in_present_names(kind: type, settings: Mapping[str, Any]) -> dict[str, Any]:
     """
     :param kind: class of the algorithm
-    :param settings: of runs, as they were recorded
-    :return: the same, with the arguments that a suite has among them by the names that they have now
+    :param settings: settings of runs, as they were recorded
+    :return: the same settings, with the arguments in ``overrides`` and ``definition`` by their present names
     """
     layers = {name: settings[name] for name in ("overrides", "definition") if settings.get(name)}
     return {**settings, **{name: in_present_names(kind, layer) for name, layer in layers.items()}}

@@ -1,4 +1,4 @@
-"""Timing in alternation: whatever else the machine does falls on all contenders alike, and their ratios stand."""
+"""Timing in alternation: other work of the machine slows all contenders alike, so that the ratios of their times hold."""
 
 import multiprocessing
 import time
@@ -15,12 +15,14 @@ Timer = Callable[[int], float]
 
 def timer(step: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> Timer:
     """
-    :param step: what to time, in this process
-    :param clock: in seconds; ``time.process_time`` leaves out what other programs take, for steps of one thread
+    :param step: function to time, in this process
+    :param clock: function that returns the time in seconds; ``time.process_time`` leaves out the time of other programs, and
+        is meant for steps with one thread
+    :return: timer of the function
     """
 
     def seconds(repetitions: int) -> float:
-        step()  # what the others left in the caches is not this one's
+        step()  # the caches hold the data of the other contenders
         start = clock()
         for _ in range(repetitions):
             step()
@@ -37,13 +39,13 @@ def process_timers(
     clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[dict[str, Timer]]:
     """
-    Contenders in processes of their own: the threads of one, which wait busily for more work, take no time from another.
+    Contenders in processes of their own: the threads of one contender, which wait busily for work, take no time from another.
 
-    :param make: of a module, makes a step from arguments
-    :param arguments: name -> arguments
-    :param threads: torch's, in each process
-    :param clock: see :func:`timer`
-    :return: name -> timer, for as long as the context lasts
+    :param make: function at the top level of a module that makes a contender's step from its arguments
+    :param arguments: name of a contender -> arguments of ``make``
+    :param threads: number of torch's threads in each process
+    :param clock: function that returns the time in seconds, see :func:`timer`
+    :return: name of a contender -> timer, which can be used as long as the context lasts
     """
     context = multiprocessing.get_context("spawn")
     connections: dict[str, Connection] = {}
@@ -63,13 +65,13 @@ def process_timers(
 
     try:
         for connection in connections.values():
-            connection.recv()  # ready
+            connection.recv()  # wait until the contender is ready
         yield {name: remote(connection) for name, connection in connections.items()}
     finally:
         for connection in connections.values():
             connection.close()  # ends its process
         for process in processes:
-            process.join()  # what is timed next has the machine to itself
+            process.join()  # so that the next measurement has the machine to itself
 
 
 def _serve(
@@ -91,13 +93,13 @@ def _serve(
 
 def alternate(timers: dict[str, Timer], repetitions: int, rounds: int) -> dict[str, list[float]]:
     """
-    :param timers: name -> timer
-    :param repetitions: per measurement
-    :param rounds: measurements of each
-    :return: name -> seconds, one number per round
+    :param timers: name of a contender -> timer
+    :param repetitions: number of repetitions of each measurement
+    :param rounds: number of measurements of each contender
+    :return: name of a contender -> seconds of one repetition, one number for each round
     """
     seconds: dict[str, list[float]] = {name: [] for name in timers}
-    for _ in range(rounds + 1):  # the first warms up
+    for _ in range(rounds + 1):  # the first round warms up
         for name, one in timers.items():
             seconds[name].append(one(repetitions))
     return {name: values[1:] for name, values in seconds.items()}

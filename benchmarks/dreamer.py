@@ -1,12 +1,13 @@
 """
-DreamerV3 on the learner's view, by the package sheeprl, as a program of :mod:`benchmarks.external`::
+DreamerV3 on the learner's observations, by the package sheeprl, as a program of :mod:`benchmarks.external`::
 
     python -m benchmarks.dreamer benchmarks/runs/<run>/request.json
 
-Of ``arguments``, ``size`` is that of the model ("1M" to "400M") and ``configuration`` has sheeprl's settings by their dotted
-names. It is the algorithm of the paper in Nature (2025), ``dreamer_v3_5`` in sheeprl. What goes on from a checkpoint has its
-networks, optimiser and replay buffer, and starts new episodes. Evaluations take the most likely action in each state, but
-sheeprl draws the state itself, also then: they draw from the evaluation's seed, and training never notices.
+The request's ``arguments`` may have ``size``, the size of the model ("1M" to "400M"), and ``configuration``, sheeprl's
+settings by their dotted names. The algorithm is that of the paper in Nature (2025), ``dreamer_v3_5`` in sheeprl. A run that
+goes on from a checkpoint has the checkpoint's networks, optimiser and replay buffer, and starts new episodes. Evaluations
+take the most likely action in each state. The state itself is sampled by sheeprl in evaluations too, from the evaluation's
+seed, which leaves the random numbers of training untouched.
 """
 
 import json
@@ -36,15 +37,15 @@ except ImportError as error:
 
 SIZES = ("1M", "12M", "25M", "50M", "100M", "200M", "400M")
 KEY = "partial"
-LARGEST_BUFFER = 5_000_000  # sheeprl's, and the paper's
+LARGEST_BUFFER = 5_000_000  # the capacity in sheeprl and in the paper
 
 
 class LearnersView(gym.ObservationWrapper):
     """
-    What the learner sees, and nothing else.
+    Reduces observations to the entry ``partial``, which the learner sees.
 
-    :param env: with an entry ``partial``
-    :raises ValueError: if that is no vector of numbers
+    :param env: environment whose observations have an entry ``partial``
+    :raises ValueError: if that entry is no vector of numbers
     """
 
     def __init__(self, env: gym.Env):
@@ -56,25 +57,27 @@ class LearnersView(gym.ObservationWrapper):
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """
-        :param observation: of the environment
-        :return: its entry ``partial``
+        :param observation: observation of the environment
+        :return: observation with no other entry than ``partial``
         """
         return {KEY: observation[KEY]}
 
 
 def make_env(request: str) -> gym.Env:
     """
-    :param request: path
-    :return: environment to train on, for sheeprl to make
+    Make an environment to train on; called by sheeprl.
+
+    :param request: path of the request
+    :return: environment whose observations are the learner's
     """
     return LearnersView(Request(request).make_env())
 
 
 class Player:
     """
-    The policy, as SB3's ``evaluate_policy`` knows them.
+    The policy, with the interface of SB3's ``evaluate_policy``.
 
-    :param player: sheeprl's, which keeps a state for each environment
+    :param player: sheeprl's player, which keeps a state for each environment
     :param env: one of the environments to train on
     """
 
@@ -92,11 +95,11 @@ class Player:
         deterministic: bool = True,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
         """
-        :param observation: entries of shape (n, ...)
-        :param state: ``None`` at the start; then what was returned
-        :param episode_start: shape (n,), where an episode has just begun
-        :param deterministic: whether the most likely action is taken
-        :return: actions, shape (n, ...), as the environment takes them
+        :param observation: observations of n environments, each entry of shape (n, ...)
+        :param state: ``None`` at the start of an evaluation, then the state that the last call returned
+        :param episode_start: whether an episode has just begun, shape (n,)
+        :param deterministic: whether to take the most likely action
+        :return: actions in the environment's own range, shape (n, ...), and a state, which is empty
         """
         partial = th.as_tensor(observation[KEY], dtype=th.float32, device=self._player.device)
         if state is None:
@@ -113,9 +116,9 @@ class Player:
 
 class Evaluation:
     """
-    What sheeprl calls before it writes a checkpoint: a checkpoint has its evaluation.
+    A callback that sheeprl calls before it writes a checkpoint, so that every checkpoint has its evaluation.
 
-    :param request: path
+    :param request: path of the request
     """
 
     def __init__(self, request: str):
@@ -124,10 +127,12 @@ class Evaluation:
 
     def on_checkpoint_coupled(self, fabric: Any, ckpt_path: str, state: Mapping[str, Any], replay_buffer: Any = None) -> None:
         """
-        :param fabric: of the run
-        :param ckpt_path: which is to be written
-        :param state: of the networks, and how far the run is
-        :param replay_buffer: not looked at
+        Evaluate the policy, and write the networks to ``model.pt``.
+
+        :param fabric: sheeprl's ``Fabric`` of the run
+        :param ckpt_path: path of the checkpoint that sheeprl writes next
+        :param state: state of the networks, and under "last_checkpoint" the environment steps so far
+        :param replay_buffer: replay buffer of the run, which is not used
         """
         timesteps = int(state["last_checkpoint"])
         self._request.go_on_from(timesteps - 1)
@@ -138,7 +143,7 @@ class Evaluation:
         print(f"{timesteps} steps: {mean_return:.1f}", flush=True)
 
     def _player(self, fabric: Any, ckpt_path: str, state: Mapping[str, Any]) -> Player:
-        """With networks beside those that train, made as sheeprl does to evaluate a checkpoint."""
+        """The policy, with networks of its own, made as sheeprl makes them to evaluate a checkpoint."""
         configuration = dotdict(OmegaConf.to_container(fs.load_yaml(fs.run_config(ckpt_path)), resolve=True))
         actions = self._env.action_space
         sizes = actions.shape if isinstance(actions, spaces.Box) else [actions.n]  # type: ignore[attr-defined]
@@ -151,9 +156,9 @@ class Evaluation:
 
 def command_line(request: Request) -> list[str]:
     """
-    :param request: of the run
-    :return: sheeprl's arguments
-    :raises ValueError: if an argument is unknown, or one that follows from the run
+    :param request: request for the run
+    :return: command-line arguments of sheeprl
+    :raises ValueError: if an argument is unknown, or sets a value that follows from the run's settings
     """
     if unknown := sorted(set(request.arguments) - {"size", "configuration"}):
         raise ValueError(f"arguments: unknown {unknown}; they are size and configuration.")
@@ -170,8 +175,8 @@ def command_line(request: Request) -> list[str]:
 
 def in_hydra(value: Any) -> str:
     """
-    :param value: number, text, ``None``, or a list or mapping of such
-    :return: in the grammar of Hydra's command line
+    :param value: number, text, ``None``, or a list or mapping of these
+    :return: value in the grammar of Hydra's command line
     """
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{in_hydra(inner)}" for key, inner in value.items()) + "}"
@@ -182,8 +187,8 @@ def in_hydra(value: Any) -> str:
 
 def settings_of(request: Request) -> dict[str, Any]:
     """
-    :param request: of the run
-    :return: sheeprl's settings that follow from it
+    :param request: request for the run
+    :return: sheeprl's settings that follow from the request, by their dotted names
     """
     spec, path, logs = request.spec, str(request.path), request.checkpoint / "sheeprl"
     callbacks = [
@@ -202,7 +207,7 @@ def settings_of(request: Request) -> dict[str, Any]:
         "algo.cnn_keys.encoder": [],
         "algo.total_steps": max(spec.steps, request.evaluations[-1]),
         "algo.run_test": False,
-        "buffer.size": min(LARGEST_BUFFER, 2 * max(spec.steps, 1_000)),  # an episode's last observation has a place too
+        "buffer.size": min(LARGEST_BUFFER, 2 * max(spec.steps, 1_000)),  # the last observation of an episode takes a place too
         "checkpoint.every": request.evaluations[0],
         "checkpoint.save_last": False,
         "checkpoint.resume_from": str(checkpoints[-1]) if checkpoints else None,
@@ -215,7 +220,7 @@ def settings_of(request: Request) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Command line: the path of a request."""
+    """Entry point of the command line, whose only argument is the path of a request."""
     request = Request(sys.argv[1])
     sys.argv = ["sheeprl", *command_line(request)]
     print(" ".join(sys.argv), flush=True)
@@ -225,8 +230,10 @@ def main() -> None:
 
 def keep_logs(checkpoint: Path, directory: Path) -> None:
     """
-    :param checkpoint: directory that is removed when the run is finished
-    :param directory: where its TensorBoard logs go
+    Copy TensorBoard logs out of a directory that is removed when the run is finished.
+
+    :param checkpoint: directory that has the logs
+    :param directory: directory to which the logs are copied
     """
     directory.mkdir(exist_ok=True)
     for log in sorted(checkpoint.rglob("events.out.tfevents.*")):

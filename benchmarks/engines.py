@@ -1,4 +1,4 @@
-"""Where a run's process is started: on this machine, or on some node of a Ray cluster that shares the runs' directory."""
+"""Engines start the processes of runs: on this machine, or on a Ray cluster that shares the directory of the runs."""
 
 import ctypes
 import os
@@ -13,20 +13,21 @@ from typing import Any
 from benchmarks.suite import HERE
 from sb3_gac.envs.suites.extras import missing_extra
 
-#: Begins the line of a log before an attempt's output
+#: Beginning of the line that stands before an attempt's output in a log
 ATTEMPT = "--- attempt: "
 NODE_LOSSES = 10
 _PR_SET_PDEATHSIG = 1
-_prctl: Any = ctypes.CDLL(None).prctl if sys.platform == "linux" else None  # elsewhere runs outlive a killed launch
+_prctl: Any = ctypes.CDLL(None).prctl if sys.platform == "linux" else None  # on other systems runs outlive a killed launch
 
 
 def run_process(command: list[str], log: Path) -> int:
     """
-    A process with one thread, which ends with the one that started it: a lost node leaves no half-run behind.
+    Run a command in a process with one thread. The process ends with the one that started it, so that no run goes on training
+    after its launch was killed or its node was lost.
 
-    :param command: to run
-    :param log: where its output is added
-    :return: exit status
+    :param command: words of the command
+    :param log: file to which the output is appended
+    :return: exit status of the process
     """
     with log.open("a") as file:
         file.write(f"{ATTEMPT}{shlex.join(command)}\n")
@@ -44,9 +45,10 @@ def run_process(command: list[str], log: Path) -> int:
 
 def end_with_parent(parent: int) -> None:
     """
-    In a process that begins: it is killed when the thread that started it ends. Not so elsewhere than on Linux.
+    Make the system kill this process when the thread that started it ends. It is called in the new process, and does nothing
+    on systems other than Linux.
 
-    :param parent: number of the process that starts it, which may have ended before this is called
+    :param parent: id of the process that started the new one, which may have ended before this call
     """
     if _prctl:
         _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -55,7 +57,7 @@ def end_with_parent(parent: int) -> None:
 
 
 class LocalEngine:
-    """This machine."""
+    """Runs processes on this machine."""
 
     cpus = os.cpu_count() or 1
 
@@ -66,9 +68,9 @@ class LocalEngine:
 
 class RayEngine:
     """
-    A Ray cluster. A run whose node is lost starts again on another one, from its last checkpoint.
+    Runs processes on a Ray cluster. If a node is lost, its run starts again on another node, from its last checkpoint.
 
-    :param address: of the cluster, "auto" for the one that this machine belongs to
+    :param address: address of the cluster, "auto" for the one that this machine belongs to
     :raises ImportError: if Ray is not installed
     """
 

@@ -1,4 +1,4 @@
-"""The environment of a run: a registered task with its sensor noise, or any of gymnasium's, with arguments and wrappers."""
+"""The environment of a run: a registered task with its sensor noise, or any environment with arguments and wrappers."""
 
 from typing import Any
 
@@ -9,20 +9,20 @@ from sb3_gac.envs import make_vec
 from sb3_gac.envs.suites import SUITES, env_id_of, suite_of, task_of
 from sb3_gac.training.environments import make_envs as make_any_envs
 
-#: Of the environments of every evaluation
+#: Seed of the first environment of every evaluation
 EVAL_SEED = 10_000
 
 
 def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
     """
-    :param spec: of a run
-    :return: id and keyword arguments of its environment; without sensor noise there need be no argument for it
-    :raises ValueError: if there is no such task
+    :param spec: settings of a run
+    :return: id and keyword arguments of the run's environment; a task without sensor noise gets no argument for it
+    :raises ValueError: if there is no such task, or if the task takes no sensor noise or no history and the run has one
     """
     if spec.environment is not None:
         return spec.environment["id"], spec.environment["kwargs"]
     env_id = env_id_of(spec.task)
-    if spec.task != task_of(env_id):  # directories and tables have its name
+    if spec.task != task_of(env_id):  # directories and tables show this name
         raise ValueError(f"task must be the name {task_of(env_id)!r}, got {spec.task!r}.")
     suite = suite_of(env_id)
     takes_noise = suite is None or SUITES[suite].sensor_noise
@@ -36,9 +36,10 @@ def environment(spec: RunSpec) -> tuple[str, dict[str, Any]]:
 
 def make_envs(spec: RunSpec, n_envs: int, seed: int | None = None) -> VecEnv:
     """
-    :param spec: of a run
-    :param n_envs: side by side
-    :param seed: of the first one
+    :param spec: settings of a run
+    :param n_envs: number of environments side by side
+    :param seed: seed of the first environment, ``None`` for no seed
+    :return: vectorised environment of the run
     :raises ValueError: if a wrapper can't be imported
     """
     env_id, kwargs = environment(spec)

@@ -1,17 +1,18 @@
 """
-An algorithm that is a program of its own, with whatever interpreter, language and packages it takes: an entry such as ::
+Algorithms that are programs of their own, in any language, with an interpreter and packages of their own. An entry is::
 
     mine: {class: "benchmarks.external:Program", command: [python, -m, my_module], packages: [my-package], arguments: {a: 1}}
 
-The program is started in the checkout, with the path of ``request.json`` in the run's directory as its last argument: ``run``
-(the run's settings), ``environment`` (``id``, ``kwargs``, ``wrappers``), ``evaluations`` (environment steps at which it
-evaluates), ``eval_seed`` (what the evaluation environments are seeded with before each one), ``arguments`` (its own) and
-``path`` (where the environment's modules may be, beside all that is on Python's path).
+The program is started in the checkout. Its last argument is the path of ``request.json`` in the run's directory, which has
+the keys ``run`` (the run's settings), ``environment`` (``id``, ``kwargs``, ``wrappers``), ``evaluations`` (environment steps
+at which the program evaluates), ``eval_seed`` (seed of the evaluation environments before every evaluation), ``arguments``
+(the program's own) and ``path`` (folders where the environment's modules may be, beside those on Python's path).
 
-It writes ``checkpoint/evaluations.csv`` beside the request, anew and in one move after every evaluation: ``timesteps``,
-``learner`` (the mean return) and whatever other numbers, one row for each of ``evaluations``. Then it ends with status 0.
-``checkpoint`` is its own to go on from when it is started again, and is removed when the run is finished; what is beside it
-stays. :mod:`benchmarks.program` does all of this for programs in Python.
+The program writes ``checkpoint/evaluations.csv`` beside the request, anew and in one move after every evaluation. The file
+has one row for each of ``evaluations``, with ``timesteps``, ``learner`` (the mean return) and any other numbers. At its end
+the program exits with status 0. The folder ``checkpoint`` is for the program's own checkpoints, from which it goes on when
+it is started again; it is removed when the run is finished, while the files beside it stay. :mod:`benchmarks.program` does
+all of this for programs in Python.
 """
 
 import json
@@ -49,16 +50,17 @@ _LOOK_EVERY = 1.0  # seconds
 
 class Program:
     """
-    What stands where other algorithms have their class.
+    A program that stands in the place of an algorithm's class.
 
-    :param command: its words; ``python`` as the first one is the interpreter
-    :param python: environment variable with the path of that interpreter; without one, or where it is not set, this process's
-    :param packages: distributions that the interpreter must have, whose versions are recorded
-    :param arguments: of the program
-    :raises ValueError: naming an argument that is something else
+    :param command: words of the command; ``python`` as the first word stands for the interpreter
+    :param python: environment variable that holds the path of the interpreter; if it is ``None`` or not set, this process's
+        interpreter is used
+    :param packages: names of the distributions that the interpreter must have, whose versions are recorded
+    :param arguments: arguments of the program itself
+    :raises ValueError: naming an argument of another type
     """
 
-    #: For those who ask algorithms
+    #: A program has no policy classes; code that handles algorithms reads this attribute
     policy_aliases: ClassVar[Mapping[str, type]] = {}
 
     def __init__(
@@ -79,19 +81,19 @@ class Program:
 
     @property
     def interpreter(self) -> str:
-        """Which ``python`` is meant."""
+        """The path of the Python interpreter."""
         return os.environ.get(self._variable or "") or sys.executable
 
     @property
     def command(self) -> list[str]:
-        """All words but the last."""
+        """The words of the command, without the path of the request, which is added as the last one."""
         first, *others = self._words
         return [self.interpreter if first == "python" else first, *others]
 
     def versions(self) -> dict[str, str]:
         """
-        :return: of the interpreter and the packages; nothing, if the program needs no packages
-        :raises ValueError: saying what is not installed, and where
+        :return: "python" and each package -> version; empty if the program needs no packages
+        :raises ValueError: naming the packages that are not installed and the interpreter, or if the interpreter can't be run
         """
         if not self._packages:
             return {}
@@ -109,10 +111,12 @@ class Program:
 
     def run(self, spec: RunSpec, directory: Path) -> Rows:
         """
-        :param spec: of the run
-        :param directory: of the run, which nobody else uses
-        :return: one row per evaluation
-        :raises RuntimeError: if the program fails, or ends without all of them
+        Make a run, or go on with it.
+
+        :param spec: settings of the run
+        :param directory: directory of the run, which no other process uses
+        :return: one row for each evaluation
+        :raises RuntimeError: if the program fails, or ends without all evaluations
         """
         (directory / CHECKPOINT).mkdir(exist_ok=True)
         write_atomically(directory / REQUEST, json.dumps(request_of(spec, self._arguments), indent=1))
@@ -125,9 +129,9 @@ class Program:
 
 def request_of(spec: RunSpec, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """
-    :param spec: of a run
-    :param arguments: of the program
-    :return: what it is asked for
+    :param spec: settings of a run
+    :param arguments: arguments of the program itself
+    :return: content of the run's ``request.json``
     """
     env_id, kwargs = environment(spec)
     wrappers = spec.environment["wrappers"] if spec.environment else []
@@ -142,7 +146,13 @@ def request_of(spec: RunSpec, arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _watch(command: list[str], directory: Path) -> Rows:
-    """Run it to its end, with ``timing.json`` for its last evaluation at any time; all of its evaluations."""
+    """
+    Run a program to its end, and keep ``timing.json`` up to date with its last evaluation.
+
+    :param command: words of the command
+    :param directory: directory of the run
+    :return: one row for each evaluation
+    """
     rows, started = read_rows(directory), time.time()
     before = read_seconds(directory / TIMING) if rows else 0.0
     path = os.pathsep.join(filter(None, [str(HERE.parent), os.environ.get("PYTHONPATH")]))
@@ -166,7 +176,7 @@ def _are_texts(words: Sequence[Any]) -> bool:
 
 
 def _own_places() -> list[str]:
-    """Where modules are found that are no part of this interpreter's installation, such as those beside a suite."""
+    """The folders on Python's path outside of this interpreter's installation, such as the one beside a suite."""
     installed = {Path(prefix).resolve() for prefix in (sys.prefix, sys.base_prefix)}
     places = [Path(place).resolve() for place in sys.path if place]
     return [str(place) for place in places if not any(place.is_relative_to(prefix) for prefix in installed)]
@@ -174,8 +184,8 @@ def _own_places() -> list[str]:
 
 def evaluation_times(spec: RunSpec) -> list[int]:
     """
-    :param spec: of a run
-    :return: environment steps at which every algorithm is evaluated: after whole steps of all environments
+    :param spec: settings of a run
+    :return: environment steps at which every algorithm is evaluated, each a multiple of the number of environments
     """
     every = spec.eval_every // spec.envs * spec.envs
     end = -(-spec.steps // spec.envs) * spec.envs

@@ -1,4 +1,4 @@
-"""Finished runs: from their directories, or, without those, from results that they were aggregated to before."""
+"""Finished runs, read from their directories or from the results into which they were aggregated before."""
 
 import argparse
 import json
@@ -15,21 +15,21 @@ from benchmarks.config import in_present_names, read_algorithm, resolve, setting
 from benchmarks.suite import UNSAID, RunSpec, made_with
 from benchmarks.tidy import NEEDED, NO_NOISE, read_tidy
 
-#: What tells a suite's runs apart
+#: The columns that together identify a run of a suite
 NAMES = ["task", "noise", "algorithm", "seed"]
 _PARTICULARS = ["environment", "definition", "needs", "history"]
 
 
 class FinishedRun(NamedTuple):
     """
-    What is left of a run, and what its results are made of.
+    The records of a finished run, from which results are made.
 
-    :param spec: of the run
-    :param evaluations: one row per evaluation
-    :param arguments: of the algorithm
-    :param origins: commit and versions of the processes that made it
-    :param seconds: that they took, ``None`` if that is not known
-    :param cpus: of the machine
+    :param spec: settings of the run
+    :param evaluations: table with one row for each evaluation
+    :param arguments: arguments of the algorithm
+    :param origins: commit and versions of the processes that made the run, one entry for each distinct combination
+    :param seconds: seconds that the run took, ``None`` if they were not recorded
+    :param cpus: number of CPUs of the machine
     """
 
     spec: RunSpec
@@ -41,30 +41,30 @@ class FinishedRun(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its directory, below that of all runs."""
+        """The run's directory, relative to that of all runs."""
         return name_of(self.spec)
 
 
 def name_of(spec: RunSpec) -> str:
     """
-    :param spec: of a run
-    :return: its directory, below that of all runs
+    :param spec: settings of a run
+    :return: the run's directory, relative to that of all runs
     """
     return str(spec.directory(Path()))
 
 
 def kind_of(spec: RunSpec) -> str:
     """
-    :param spec: of a run
-    :return: what runs with the same arguments have in common
+    :param spec: settings of a run
+    :return: name of the algorithm in the cell, which all seeds share: such as "gac, Hopper, noise 0.1"
     """
     return f"{spec.algorithm}, {spec.title}" + ("" if spec.noise is None else f", noise {spec.noise:g}")
 
 
 def names_of(spec: RunSpec) -> dict[str, Any]:
     """
-    :param spec: of a run
-    :return: ``NAMES`` -> what a table has there
+    :param spec: settings of a run
+    :return: each of ``NAMES`` -> the run's value in that column of a table
     """
     shown = {"task": spec.title, "noise": NO_NOISE if spec.noise is None else spec.noise}
     return {name: getattr(spec, name) for name in NAMES} | shown
@@ -72,24 +72,26 @@ def names_of(spec: RunSpec) -> dict[str, Any]:
 
 def particulars_of(spec: RunSpec) -> dict[str, Any]:
     """
-    :param spec: of a run
-    :return: what not all runs of its suite have: an environment that is no registered task, a definition, needs, a history
+    :param spec: settings of a run
+    :return: settings that not all runs of its suite share, if the run has them: an environment that is no registered task, a
+        definition, needs and a history
     """
     return {name: value for name, value in asdict(spec).items() if name in _PARTICULARS and value is not None}
 
 
 def settings_of(spec: RunSpec) -> dict[str, Any]:
     """
-    :param spec: of a run
-    :return: what all runs of its suite have in common
+    :param spec: settings of a run
+    :return: settings that all runs of its suite share
     """
     return {name: value for name, value in asdict(spec).items() if name not in [*NAMES, *_PARTICULARS]}
 
 
 def read_directory(spec: RunSpec, runs: Path) -> FinishedRun:
     """
-    :param spec: of a finished run
+    :param spec: settings of a finished run
     :param runs: directory of all runs
+    :return: records of the run
     """
     directory = spec.directory(runs)
     configuration = yaml.safe_load((directory / "config.yaml").read_text())
@@ -104,7 +106,7 @@ def read_directory(spec: RunSpec, runs: Path) -> FinishedRun:
 
 
 class _FormerName(argparse.Action):
-    """Of an option, for one release: it does what the present one does, and says so."""
+    """The former name of an option, kept for one release: it works as the present one, and prints a warning."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option_string: Any = None) -> None:
         present = "--" + self.dest.replace("_", "-")
@@ -114,7 +116,9 @@ class _FormerName(argparse.Action):
 
 def add_reuse_options(parser: argparse.ArgumentParser) -> None:
     """
-    :param parser: of a program that counts runs which were made elsewhere, see :func:`read_reused`
+    Add ``--reuse-results`` and ``--rerun``.
+
+    :param parser: parser of a program that counts runs which were made elsewhere, see :func:`read_reused`
     """
     results: dict[str, Any] = {"dest": "reuse_results", "type": Path, "nargs": "+", "default": ()}
     rerun: dict[str, Any] = {"dest": "rerun", "nargs": "+", "default": (), "metavar": "ALGORITHM"}
@@ -126,10 +130,10 @@ def add_reuse_options(parser: argparse.ArgumentParser) -> None:
 
 def read_reused(results: Sequence[Path], specs: Sequence[RunSpec], rerun: Sequence[str]) -> dict[str, FinishedRun]:
     """
-    :param results: of earlier runs, without a suffix; the later over the earlier ones
-    :param specs: of runs that may be among them
-    :param rerun: algorithms whose runs do not count
-    :return: name -> those that are, see :func:`read_results`
+    :param results: paths of results, without a suffix; where two have the same run, the later path counts
+    :param specs: settings of the runs to look for
+    :param rerun: names of the algorithms whose runs do not count
+    :return: run's name -> records of each run that was found, see :func:`read_results`
     """
     wanted = [spec for spec in specs if spec.algorithm not in rerun]
     return {name: run for path in results for name, run in read_results(path, wanted).items()}
@@ -137,10 +141,10 @@ def read_reused(results: Sequence[Path], specs: Sequence[RunSpec], rerun: Sequen
 
 def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]:
     """
-    :param path: of results, without a suffix
-    :param specs: of runs that may be among them
-    :return: name -> those that are, if they were made with the settings and arguments that the spec has now
-    :raises ValueError: if the results do not tell their runs apart
+    :param path: path of results, without a suffix
+    :param specs: settings of the runs to look for
+    :return: run's name -> records of each run that was found, if it was made with the settings and arguments of today's suite
+    :raises ValueError: if the results have no record of single runs
     """
     results = json.loads(path.with_suffix(".json").read_text())
     if "runs" not in results:

@@ -1,6 +1,6 @@
 """
-What privileged information is worth on a task: differences of returns between algorithms that see it at deployment, in
-training, or never, with intervals that hold for few seeds, and what follows from them in words. Of aggregated results::
+The worth of privileged information on a task: differences of returns between algorithms that see it at deployment, in
+training, or never, with intervals that hold for few seeds, and conclusions in words. For aggregated results, the command ::
 
     python -m benchmarks.headroom benchmarks/results/baselines --reference sac-asym
 
@@ -23,29 +23,29 @@ from benchmarks.tidy import read_tidy
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
-#: What algorithms are called in sentences
+#: Algorithm -> its name in sentences
 TITLES = {FULL: "SAC on the full state", ASYMMETRIC: "SAC-asym", GUIDED: "GAC", PARTIAL: "SAC on partial alone"}
-#: Of what can be deployed, the simpler first: where several come equally far, the first is enough
+#: Algorithms without privileged entries at deployment, the simplest first: of several that come equally far, it is enough
 SIMPLER_FIRST = (PARTIAL, ASYMMETRIC, GUIDED)
-#: Part of a run's evaluations whose mean is its end: one evaluation of a few episodes says little
+#: Share of a run's evaluations, the last ones, whose mean is the run's end; one evaluation of a few episodes says little
 END = 0.25
-#: Part of all that was learned that does not matter
+#: Share of the learned return below which a difference does not matter
 NEGLIGIBLE = 0.05
-#: ... and the part that the number of seeds is worked out for, to be seen in four of five repetitions
+#: Share of the learned return that the recommended number of seeds shows in four of five repetitions
 WORTH_SEEING, _POWER_QUANTILES = 0.1, float(stats.norm.ppf(0.975) + stats.norm.ppf(0.8))
 
 
 class Worth(NamedTuple):
     """
-    What privileged information is worth on a task.
+    The worth of privileged information on a task.
 
-    :param ends: algorithm -> mean return over the last quarter of the evaluations, one by seed
-    :param areas: algorithm -> mean return over all evaluations, one by seed
-    :param random: mean return of actions at random, and the ends of its interval
-    :param span: what was learned: from the return of random actions to the best mean end
-    :param headroom: the full state over SAC-asym, if both are there
-    :param in_training: SAC-asym over SAC on partial alone, if both are there
-    :param guider: GAC over SAC-asym, if both are there
+    :param ends: algorithm -> each seed's end, the mean return over the last quarter of the evaluations, shape (N,)
+    :param areas: algorithm -> each seed's mean return over all evaluations, shape (N,)
+    :param random: mean return of random actions, and the two ends of its interval
+    :param span: learned return: the best algorithm's mean end, less the mean return of random actions
+    :param headroom: difference of SAC on the full state over SAC-asym, ``None`` if one of the two has no runs
+    :param in_training: difference of SAC-asym over SAC on partial alone, ``None`` if one of the two has no runs
+    :param guider: difference of GAC over SAC-asym, ``None`` if one of the two has no runs
     """
 
     ends: dict[str, np.ndarray]
@@ -58,21 +58,21 @@ class Worth(NamedTuple):
 
     @property
     def learned(self) -> list[str]:
-        """Algorithms of which most seeds end above random actions, beyond chance."""
+        """The algorithms whose median end is above the interval of random actions."""
         return [name for name, end in self.ends.items() if np.median(end) > self.random[2]]
 
     @property
     def deployable(self) -> list[str]:
-        """Algorithms that need no privileged entry at deployment, the simpler first."""
+        """The algorithms that need no privileged entry at deployment, the simplest first."""
         others = [name for name in self.ends if name not in (FULL, *SIMPLER_FIRST)]
         return [name for name in SIMPLER_FIRST if name in self.ends] + others
 
 
 def worth(tidy: pd.DataFrame, random_returns: np.ndarray) -> Worth:
     """
-    :param tidy: evaluations of one task: algorithm, seed, timesteps, learner
-    :param random_returns: of episodes with actions at random
-    :return: what privileged information is worth on it
+    :param tidy: evaluations of one task, with the columns algorithm, seed, timesteps and learner
+    :param random_returns: returns of episodes with random actions, shape (N,)
+    :return: worth of privileged information on the task
     """
     ends = by_algorithm(tidy, end_of)
     pairs = ((FULL, ASYMMETRIC), (ASYMMETRIC, PARTIAL), (GUIDED, ASYMMETRIC))
@@ -84,17 +84,17 @@ def worth(tidy: pd.DataFrame, random_returns: np.ndarray) -> Worth:
 
 def end_of(returns: np.ndarray) -> float:
     """
-    :param returns: of a run's evaluations, in their order
-    :return: the mean of the last quarter
+    :param returns: mean returns of a run's evaluations, in their order, shape (N,)
+    :return: mean of the last quarter of the evaluations
     """
     return float(returns[-math.ceil(END * len(returns)) :].mean())
 
 
 def by_algorithm(tidy: pd.DataFrame, score: Callable[[np.ndarray], float]) -> dict[str, np.ndarray]:
     """
-    :param tidy: see :func:`worth`
-    :param score: of the returns of a run's evaluations
-    :return: algorithm -> its runs' scores
+    :param tidy: evaluations, see :func:`worth`
+    :param score: function of a run's mean returns, in the order of the evaluations
+    :return: algorithm -> scores of its runs, shape (N,)
     """
     scores: dict[str, list[float]] = {str(name): [] for name in tidy.algorithm.unique()}
     for (name, _), run in tidy.sort_values("timesteps", kind="stable").groupby(["algorithm", "seed"], sort=False):
@@ -104,9 +104,9 @@ def by_algorithm(tidy: pd.DataFrame, score: Callable[[np.ndarray], float]) -> di
 
 def headroom_curve(tidy: pd.DataFrame) -> pd.DataFrame:
     """
-    :param tidy: see :func:`worth`
-    :return: "timesteps", and "value", "low" and "high" of the full state's mean return over SAC-asym's there; no rows without
-        both
+    :param tidy: evaluations, see :func:`worth`
+    :return: table with one row for each evaluation: "timesteps", and the mean return of SAC on the full state less that of
+        SAC-asym, "value", with the ends of its interval, "low" and "high"; empty if one of the two has no runs
     """
     rows = []
     for step, at_step in tidy.groupby("timesteps"):
@@ -119,10 +119,10 @@ def headroom_curve(tidy: pd.DataFrame) -> pd.DataFrame:
 
 def seeds_to_see(found: Worth, part: float = WORTH_SEEING) -> int:
     """
-    :param found: of runs
-    :param part: of the span
-    :return: seeds of each algorithm with which a difference of that part is seen in four of five repetitions, judged by how
-        much the runs that are there vary
+    :param found: worth of privileged information on the task
+    :param part: size of a difference, as a share of the span
+    :return: number of seeds of each algorithm that shows such a difference in four of five repetitions, estimated from the
+        variances of the runs
     """
     variances = [float(end.var(ddof=1)) for end in found.ends.values() if len(end) > 1]
     if not variances or found.span <= 0:
@@ -132,8 +132,8 @@ def seeds_to_see(found: Worth, part: float = WORTH_SEEING) -> int:
 
 def findings(found: Worth) -> list[str]:
     """
-    :param found: of runs
-    :return: sentences, one for each question that the algorithms answer
+    :param found: worth of privileged information on the task
+    :return: sentences, one for each difference that the runs have
     """
     told = [(found.headroom, _HEADROOM), (found.in_training, _IN_TRAINING), (found.guider, _GUIDER)]
     return [_sentence(found, one, texts) for one, texts in told if one is not None]
@@ -168,9 +168,9 @@ def _sentence(found: Worth, one: Difference, texts: Mapping[str, str]) -> str:
 
 def in_words(found: Worth, one: Difference) -> str:
     """
-    :param found: of runs
-    :param one: of their differences
-    :return: such as "310 (120 to 500 with 95% confidence; 12% of what was learned)"
+    :param found: worth of privileged information on the task
+    :param one: one of its differences
+    :return: text such as "310 (120 to 500 with 95% confidence; 12% of what was learned)"
     """
     if math.isinf(one.low):
         return f"{number(one.value)} (of one seed each, which can't tell it from chance)"
@@ -180,8 +180,8 @@ def in_words(found: Worth, one: Difference) -> str:
 
 def number(value: float) -> str:
     """
-    :param value: a return, or a difference of returns
-    :return: with three digits, or all of them before the point
+    :param value: return, or difference of returns
+    :return: text with three significant digits, or with all digits before the point if there are more
     """
     if value == 0 or abs(value) >= 100:
         return f"{value:,.0f}"
@@ -190,18 +190,18 @@ def number(value: float) -> str:
 
 def counted(number: int, noun: str) -> str:
     """
-    :param number: of things
-    :param noun: for one of them, whose plural has an s
-    :return: such as "1 run" or "2 runs"
+    :param number: number of things
+    :param noun: noun in the singular, whose plural has an s
+    :return: text such as "1 run" or "2 runs"
     """
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def recommendation(found: Worth, steps: int) -> list[str]:
     """
-    :param found: of runs
-    :param steps: of each run
-    :return: sentences: what to train with, how sure that is, and what to do next
+    :param found: worth of privileged information on the task
+    :param steps: environment steps of each run
+    :return: sentences that name the algorithm to train with, how sure the choice is, and the next steps
     """
     if not found.learned:
         return [
@@ -255,8 +255,8 @@ def _next_steps(found: Worth) -> Sequence[str]:
 
 def title(algorithm: str) -> str:
     """
-    :param algorithm: its name
-    :return: what it is called in sentences
+    :param algorithm: name of an algorithm in a suite
+    :return: name of the algorithm in sentences
     """
     return TITLES.get(algorithm, algorithm)
 
@@ -264,9 +264,10 @@ def title(algorithm: str) -> str:
 def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
     """
     :param tidy: aggregated evaluations of any number of cells
-    :param reference: algorithm that the others' mean ends are compared with
-    :return: a row for each algorithm of each cell: task, noise, algorithm, each seed's end, mean, standard deviation as a
-        share of the mean, and the difference with its interval; empty fields where one is not there
+    :param reference: name of the algorithm with whose mean end the others' are compared
+    :return: one row for each algorithm of each cell: task, noise, algorithm, each seed's end, their mean, their standard
+        deviation as a share of the mean, and the difference from the reference with its interval; a value that does not exist
+        is an empty text
     """
     rows = []
     for (task, noise), cell in tidy.groupby(["task", "noise"], sort=False):
@@ -281,9 +282,9 @@ def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """
-    Command line.
+    Entry point of the command line.
 
-    :param arguments: by default the process's
+    :param arguments: command-line arguments, by default those of the process
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, help="path of aggregated results, without a suffix")

@@ -1,4 +1,4 @@
-"""Intervals of means and of their differences that hold for few seeds, by Student's t and Welch's."""
+"""Confidence intervals of means and of their differences that hold for few seeds, by Student's t and Welch's t."""
 
 import math
 import warnings
@@ -13,13 +13,13 @@ CONFIDENCE = 0.95
 
 class Difference(NamedTuple):
     """
-    Of two algorithms' mean scores.
+    The difference of two algorithms' mean scores.
 
-    :param better: name of the first
-    :param other: name of the one whose mean is taken off
-    :param value: of the difference
-    :param low: end of its interval by Welch's t test; ``-inf`` with a single seed
-    :param high: the other end
+    :param better: name of the first algorithm
+    :param other: name of the algorithm whose mean is subtracted
+    :param value: difference of the means
+    :param low: lower end of the difference's interval by Welch's t test, ``-inf`` with a single seed
+    :param high: upper end of the interval, ``inf`` with a single seed
     """
 
     better: str
@@ -30,8 +30,9 @@ class Difference(NamedTuple):
 
     def verdict(self, negligible: float) -> str:
         """
-        :param negligible: a difference that does not matter
-        :return: "more", "less", "same", if all of the interval does not matter, or "unknown"
+        :param negligible: size from which on a difference matters
+        :return: "same" if the whole interval is nearer to 0 than that; otherwise "more" if the interval is above 0, "less" if
+            it is below 0, and "unknown" if it contains 0
         """
         if -negligible < self.low and self.high < negligible:
             return "same"
@@ -40,8 +41,8 @@ class Difference(NamedTuple):
 
 def mean_interval(scores: np.ndarray) -> tuple[float, float, float]:
     """
-    :param scores: one by seed
-    :return: their mean, and the ends of its interval by Student's t, which are infinite with a single seed
+    :param scores: one score for each seed, shape (N,)
+    :return: mean of the scores, and the ends of its interval by Student's t, which are infinite with a single seed
     """
     mean, count = float(scores.mean()), len(scores)
     if count < 2:
@@ -52,10 +53,10 @@ def mean_interval(scores: np.ndarray) -> tuple[float, float, float]:
 
 def difference(scores: Mapping[str, np.ndarray], better: str, other: str) -> Difference:
     """
-    :param scores: algorithm -> one by seed
-    :param better: one of them
-    :param other: another
-    :return: of their means, with Welch's interval: the two may vary differently
+    :param scores: algorithm -> one score for each seed
+    :param better: name of an algorithm
+    :param other: name of the algorithm whose mean is subtracted
+    :return: difference of the two means, with Welch's interval, which lets the two variances differ
     """
     one, two = scores[better], scores[other]
     value = float(one.mean() - two.mean())
@@ -64,6 +65,6 @@ def difference(scores: Mapping[str, np.ndarray], better: str, other: str) -> Dif
     if one.std() == two.std() == 0:
         return Difference(better, other, value, value, value)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # that one of the two does not vary is no loss of precision
+        warnings.simplefilter("ignore", RuntimeWarning)  # scipy warns where one of the two does not vary
         low, high = stats.ttest_ind(one, two, equal_var=False).confidence_interval(CONFIDENCE)
     return Difference(better, other, value, float(low), float(high))

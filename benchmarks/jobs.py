@@ -1,4 +1,4 @@
-"""The runs of a launch: the state of each, how far it has come, why it failed, and how long the rest will take."""
+"""The runs of a launch: each run's state, its progress, the reason of its failure, and the time that is left."""
 
 import json
 import signal
@@ -20,15 +20,15 @@ _READ_AT_MOST = 1 << 16  # bytes from the end of a log, which may be long
 @dataclass
 class Job:
     """
-    A run that is left to do.
+    A run that a launch is to make.
 
-    :param spec: the run's settings
-    :param directory: where the run's files go
-    :param command: starts the run
+    :param spec: settings of the run
+    :param directory: directory of the run's files
+    :param command: words of the command that makes the run
     :param state: one of ``STATES``
-    :param needs: jobs that must be finished before
-    :param reason: why the last attempt failed, empty if none did
-    :param ended: when the job ended, in seconds of :func:`time.monotonic`
+    :param needs: jobs that must be finished before this one starts
+    :param reason: reason why the last attempt failed, empty if none failed
+    :param ended: time at which the job ended, in seconds of :func:`time.monotonic`
     """
 
     spec: RunSpec
@@ -41,24 +41,25 @@ class Job:
 
     @property
     def lacking(self) -> list["Job"]:
-        """Those that it needs, and that will never be finished."""
+        """The jobs that this one needs and that will never be finished."""
         return [job for job in self.needs if job.state in ENDED_BADLY]
 
     @property
     def is_ready(self) -> bool:
-        """Whether nothing that it needs is still to come."""
+        """Whether all jobs that this one needs have ended, well or badly."""
         return all(job.state not in ("waiting", "running") for job in self.needs)
 
     @property
     def log(self) -> Path:
-        """Where the run's output goes, that of all attempts."""
+        """The file of the run's output, over all attempts."""
         return self.directory / "log.txt"
 
 
 def last_evaluation(job: Job) -> tuple[int, float | None]:
     """
-    :param job: in any state
-    :return: environment steps at the run's last evaluation, and the learner's return there; 0 and ``None`` before the first
+    :param job: job in any state
+    :return: environment steps at the run's last evaluation, and the learner's mean return there; 0 and ``None`` before the
+        first evaluation
     """
     try:
         last = json.loads((job.directory / TIMING).read_text())
@@ -69,8 +70,8 @@ def last_evaluation(job: Job) -> tuple[int, float | None]:
 
 def count(jobs: Sequence[Job]) -> str:
     """
-    :param jobs: of this launch
-    :return: how many are in each state
+    :param jobs: jobs of a launch
+    :return: text that says how many jobs are in each state
     """
     states = Counter(job.state for job in jobs)
     return ", ".join(f"{states[state]} {state}" for state in reversed(STATES) if states[state] or state not in ENDED_BADLY)
@@ -78,9 +79,10 @@ def count(jobs: Sequence[Job]) -> str:
 
 def reason_in(log: Path, status: int) -> str:
     """
-    :param log: with the output of all attempts at a run
-    :param status: with which the last one's process ended, negative for a signal
-    :return: why it failed: the exception at the end of its last traceback; without one, the signal or the last line
+    :param log: file with the output of all attempts at a run
+    :param status: exit status of the last attempt's process, negative for the signal that ended it
+    :return: reason why the last attempt failed: the exception at the end of its last traceback; without a traceback, the
+        signal, or the last line of the output
     """
     lines = _last_attempt(log)
     tracebacks = [index for index, line in enumerate(lines) if line.startswith("Traceback (most recent call last)")]
@@ -95,7 +97,7 @@ def reason_in(log: Path, status: int) -> str:
 
 
 def _last_attempt(log: Path) -> list[str]:
-    """Lines that are not empty, of a process's output."""
+    """The lines of the last attempt's output, without empty ones."""
     try:
         with log.open("rb") as file:
             file.seek(max(log.stat().st_size - _READ_AT_MOST, 0))
@@ -103,16 +105,16 @@ def _last_attempt(log: Path) -> list[str]:
     except OSError:
         return []
     _, attempt, output = text.rpartition(ATTEMPT)
-    lines = output.splitlines()[1 if attempt else 0 :]  # of which the first is the command
+    lines = output.splitlines()[1 if attempt else 0 :]  # the first one is the command
     return [line for line in lines if line.strip()]
 
 
 class Clock:
     """
-    How long a launch still takes: from the environment steps that all its runs have made since it began.
+    Estimates the time that a launch still takes, from the environment steps that all its runs have made since it began.
 
-    :param jobs: of this launch
-    :param now: the time in seconds
+    :param jobs: jobs of the launch
+    :param now: function that returns the time in seconds
     """
 
     def __init__(self, jobs: Sequence[Job], now: Callable[[], float] = time.monotonic):
@@ -122,12 +124,12 @@ class Clock:
         self._made = 0
 
     def done_of_all(self) -> tuple[int, int]:
-        """Environment steps that are made, and those of all runs that are finished, run or wait."""
+        """The environment steps made so far, and all steps, both of the runs that are finished, running or waiting."""
         counted = [job for job in self._jobs if job.state not in ENDED_BADLY]
         return sum(map(self._done, counted)), sum(job.spec.steps for job in counted)
 
     def seconds_left(self) -> float | None:
-        """At the pace so far; ``None`` before the first evaluation."""
+        """The seconds that are left at the pace so far, ``None`` before the first evaluation."""
         now, made = self._now(), sum(self._done(job) - self._before[id(job)] for job in self._jobs)
         if made != self._made:
             self._made, self._changed = made, now
@@ -147,8 +149,8 @@ class Clock:
 
 def in_words(seconds: float) -> str:
     """
-    :param seconds: a duration
-    :return: as people say it
+    :param seconds: duration in seconds
+    :return: text in seconds, minutes, or hours and minutes
     """
     minutes = round(seconds / 60)
     if seconds < 60:

@@ -1,14 +1,14 @@
 """
-A suite -> its runs, several side by side with one thread each::
+Makes the runs of a suite, several side by side with one thread each::
 
     python -m benchmarks.launch benchmarks/suites/halfcheetah.yml --jobs 2
 
-Finished runs are skipped and unfinished ones go on from their checkpoints, so an interrupted launch is resumed by the same
-command; runs whose directories are elsewhere, or gone, count as finished if ``--reuse-results`` have them.  The whole suite is
-checked before the first run.  A failed run is tried again, and its reason is told.  What a run needs another run's model for
-comes first, once for all that need it; where that fails, they are not started.  ``--dry-run`` prints the commands of what is
-left to do, and counts them.  ``--engine ray`` runs on a Ray cluster whose nodes share this checkout, its Python and the runs'
-directory.
+Finished runs are skipped and unfinished ones go on from their checkpoints, so the same command resumes an interrupted launch.
+Runs whose directories are elsewhere, or gone, count as finished if the results named by ``--reuse-results`` contain them.
+The whole suite is checked before the first run.  A failed run is tried again; if it fails for good, the reason is printed.
+Where a run needs another run's model, the other run is made first, once for all that need it; if it fails, the runs that
+need it are not started.  ``--dry-run`` prints the commands of the runs that are left, and counts them.  ``--engine ray``
+makes the runs on a Ray cluster whose nodes share this checkout, its Python and the directory of the runs.
 """
 
 import argparse
@@ -39,12 +39,12 @@ __all__ = ["Job", "in_order", "jobs_left", "launch", "launch_one", "run_command"
 
 def jobs_left(suite: Path, runs: Path, reuse: Sequence[Path] = (), rerun: Sequence[str] = ()) -> tuple[list[Job], int]:
     """
-    :param suite: YAML file
+    :param suite: YAML file of the suite
     :param runs: directory of all runs
-    :param reuse: results, without a suffix, whose runs are finished too
-    :param rerun: algorithms of which they are not
-    :return: the runs that are not finished, those first that others need; and how many of the suite's are finished
-    :raises ValueError: naming what is wrong with the suite
+    :param reuse: paths of results, without a suffix, whose runs count as finished too
+    :param rerun: names of the algorithms whose runs in ``reuse`` do not count
+    :return: jobs of the runs that are not finished, first those that others need; and the number of the suite's finished runs
+    :raises ValueError: naming the place and the fault in the suite
     """
     specs = read_suite(suite)
     check_runs(suite.name, specs)
@@ -61,12 +61,14 @@ def _add_job(
     jobs: dict[str, Job], spec: RunSpec, command: Callable[..., list[str]], runs: Path, needed: tuple[str, ...] = ()
 ) -> Job:
     """
-    :param jobs: by name, to which the run and those that it needs are added, unless they are there
-    :param spec: of the run
-    :param command: of a run of the suite, or, with names of arguments, of what it needs
+    Add the jobs of a run and of all runs that it needs, unless they have been added before.
+
+    :param jobs: run's name -> job, to which the jobs are added
+    :param spec: settings of the run
+    :param command: function that makes the command of a run, from the arguments that lead to it from a run of the suite
     :param runs: directory of all runs
-    :param needed: from a run of the suite to this one
-    :return: the run's job
+    :param needed: arguments that lead from a run of the suite to this one, empty for a run of the suite itself
+    :return: job of the run
     """
     name = name_of(spec)
     if name not in jobs:
@@ -80,22 +82,30 @@ def _add_job(
 
 
 def _has_left(argument: str, spec: RunSpec, runs: Path) -> bool:
-    """Whether a run is finished, and what another one needs of it is there."""
+    """Whether a run is finished, and the file that another run needs of it is there."""
     return spec.is_finished(runs) and file_for(argument, spec, runs).exists()
 
 
 def run_command(suite: Path, index: int, runs: Path, needed: Sequence[str] = ()) -> list[str]:
-    """The exact command of one run, or of one that it needs."""
+    """
+    :param suite: YAML file of the suite
+    :param index: index of the run in the suite
+    :param runs: directory of all runs
+    :param needed: arguments that lead from this run to a run that it needs, empty for the run itself
+    :return: words of the command that makes the run, or the run that it needs
+    """
     command = [sys.executable, "-m", "benchmarks.run", "--suite", str(suite), "--index", str(index), "--runs", str(runs)]
     return [*command, *(["--needed", *needed] if needed else [])]
 
 
 def launch_one(job: Job, retries: int, engine: Engine, tell: Callable[[Job], None]) -> None:
     """
-    :param job: to run in a process of its own with one thread; its state says how it ended, and its reason why
-    :param retries: further attempts after one that failed
-    :param engine: where
-    :param tell: called when the state has changed, and before another attempt
+    Make a run in a process of its own with one thread. Its outcome is the job's state, with a reason if it failed.
+
+    :param job: job of the run
+    :param retries: number of further attempts after one that failed
+    :param engine: engine that starts the process
+    :param tell: function that is called with the job when its state has changed, and before another attempt
     """
     job.state, job.reason = "running", ""
     tell(job)
@@ -110,7 +120,11 @@ def launch_one(job: Job, retries: int, engine: Engine, tell: Callable[[Job], Non
 
 
 def _why_failed(job: Job, engine: Engine) -> str:
-    """Run it once; empty, if that went well. Whatever an engine or a file system raises is the failure of this run alone."""
+    """
+    Make one attempt at a run. Any error of the engine or of the file system counts as the failure of this run alone.
+
+    :return: reason why the attempt failed, empty if it did not
+    """
     try:
         job.directory.mkdir(parents=True, exist_ok=True)
         status = engine.run(job.command, job.log)
@@ -121,13 +135,13 @@ def _why_failed(job: Job, engine: Engine) -> str:
 
 def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine, finished_before: int = 0) -> None:
     """
-    Ctrl-C ends all runs at once, which then have their checkpoints, and with them this process.
+    Make runs, and show their progress. Ctrl-C ends all of them at once, and this process too; their checkpoints stay.
 
-    :param jobs: to run
-    :param at_once: how many side by side
-    :param retries: further attempts after one that failed
-    :param engine: where
-    :param finished_before: runs of the suite that need not be made
+    :param jobs: jobs of the runs to make
+    :param at_once: number of runs side by side
+    :param retries: number of further attempts after one that failed
+    :param engine: engine that starts the processes
+    :param finished_before: number of the suite's runs that were finished before
     """
     console, clock = Console(), Clock(jobs)
     draws = console.is_interactive and console.file.isatty()
@@ -136,7 +150,7 @@ def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine, finished
         said = line(jobs, job, clock)
         if not draws:
             print(said, flush=True)
-        elif job.reason:  # stays above the table
+        elif job.reason:  # a failure stays above the table
             console.print(Text(said, style="red"))
 
     shown = Live(Overview(jobs, finished_before, clock), console=console, refresh_per_second=1) if draws else nullcontext()
@@ -147,19 +161,19 @@ def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine, finished
                     future.result()
         except KeyboardInterrupt:
             print("Stopped. The same command goes on from the runs' checkpoints.", flush=True)
-            os._exit(130)  # a pool would first start and wait for all that is left
+            os._exit(130)  # a pool would first make all runs that are left
 
 
 def in_order(
     jobs: Sequence[Job], submit: Callable[[Job], "Future[None]"], tell: Callable[[Job], None]
 ) -> Iterator["Future[None]"]:
     """
-    Each job when all that it needs has ended; not at all, if that did not end well.
+    Submit each job as soon as all jobs that it needs have ended. If one of these failed, the job is not submitted.
 
-    :param jobs: to run
-    :param submit: starts a job as soon as there is room for it
-    :param tell: called when a job's state has changed to "not started"
-    :return: the futures of those that were submitted, as they end
+    :param jobs: jobs of the runs to make
+    :param submit: function that puts a job into the queue of those to start, and returns its future
+    :param tell: function that is called with a job when its state has changed to "not started"
+    :return: futures of the jobs that were submitted, as they end
     """
     left = list(jobs)
     running: set[Future[None]] = set()
@@ -173,7 +187,7 @@ def in_order(
             else:
                 running.add(submit(job))
         if running:
-            # Where another thread gets Ctrl-C's signal, this one learns of it when it next runs
+            # If another thread gets Ctrl-C's signal, this thread sees it when it next runs: within a second
             ended, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)
             yield from ended
 
@@ -203,7 +217,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Command line."""
+    """Entry point of the command line."""
     options = _parser().parse_args()
     try:
         jobs, finished = jobs_left(options.suite.resolve(), options.runs.resolve(), options.reuse_results, options.rerun)
@@ -224,7 +238,7 @@ def main() -> None:
 
 
 def _tell_end(jobs: Sequence[Job], finished: int) -> bool:
-    """Print how a launch ended; whether badly."""
+    """Print how a launch ended, and return whether any run failed or was not started."""
     failed, not_started = ([job for job in jobs if job.state == state] for state in ("failed", "not started"))
     for job in failed:
         print(f"{job.directory}: FAILED, see {job.log}: {job.reason}")

@@ -1,4 +1,4 @@
-"""What the speed benchmark times: gradient steps of several algorithms on random data, and their arithmetic."""
+"""Contenders of the speed benchmark: gradient steps of several algorithms on random data, and their arithmetic."""
 
 import importlib.util
 from collections.abc import Callable
@@ -26,7 +26,7 @@ CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {  # name -> class and argum
     "sac-asym-compiled": (sb3_gac.AsymmetricSAC, COMPILED),
 }
 PAIRS = {"critic_groups": 2, "policy_kwargs": {"n_critics": 4}}
-BASELINES: dict[str, tuple[Any, dict[str, Any]]] = {  # the same of the other algorithms
+BASELINES: dict[str, tuple[Any, dict[str, Any]]] = {  # name -> class and arguments
     "sac": CONTENDERS["sac"],
     "gac": CONTENDERS["gac"],
     "gac-share": (sb3_gac.GACShare, {}),
@@ -47,13 +47,13 @@ if importlib.util.find_spec("sbx"):
 
 class SpacesOnly(gym.Env):
     """
-    An environment that is only asked for its spaces and for random observations.
+    An environment whose observations and rewards are random.
 
-    :param partial: size of the partial entry
-    :param privileged: size of the privileged entry
-    :param actions: number of actions
-    :param length: steps per episode, ``None`` for one without an end
-    :param discrete: whether they are choices
+    :param partial: size of the entry ``partial``
+    :param privileged: size of the entry ``privileged``
+    :param actions: dimensions of an action, or number of discrete actions
+    :param length: steps of each episode, ``None`` for episodes without an end
+    :param discrete: whether actions are discrete
     """
 
     def __init__(self, partial: int, privileged: int, actions: int, length: int | None = None, discrete: bool = False):
@@ -66,13 +66,13 @@ class SpacesOnly(gym.Env):
         self.steps = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """A random observation."""
+        """Return a random observation."""
         super().reset(seed=seed)
         self.steps = 0
         return self.observation_space.sample(), {}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """A random observation and reward."""
+        """Return a random observation and a random reward."""
         self.steps += 1
         ends = self.steps == self.length
         return self.observation_space.sample(), float(self.np_random.standard_normal()), ends, False, {}
@@ -80,17 +80,17 @@ class SpacesOnly(gym.Env):
 
 def make_model(contender: str, sizes: tuple[int, int, int], batch: int, width: int, buffer_size: int = 4_000) -> Any:
     """
-    :param contender: a key of ``CONTENDERS``
-    :param sizes: partial, privileged, actions
+    :param contender: key of ``CONTENDERS``
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
     :param batch: batch size
-    :param width: of the two hidden layers
-    :param buffer_size: of the replay buffer
-    :return: a model with a buffer of random transitions
+    :param width: units of each of the two hidden layers
+    :param buffer_size: capacity of the replay buffer, in transitions
+    :return: model whose replay buffer holds random transitions
     """
     algorithm, arguments = CONTENDERS[contender]
     settings = {"batch_size": batch, "learning_starts": 10**9, "buffer_size": buffer_size, "seed": 0, "device": "cpu"}
     settings |= arguments
-    if algorithm.__module__.startswith("sbx"):  # knows no dicts
+    if algorithm.__module__.startswith("sbx"):  # it takes no dict observations
         env: gym.Env = gym.wrappers.FlattenObservation(SpacesOnly(*sizes))
         model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [width, width]}, **settings)
     else:
@@ -102,7 +102,11 @@ def make_model(contender: str, sizes: tuple[int, int, int], batch: int, width: i
 
 def make_step(contender: str, sizes: tuple[int, int, int], batch: int, width: int) -> Callable[[], None]:
     """
-    :return: one gradient step of :func:`make_model`'s model, as ``learn`` makes it
+    :param contender: key of ``CONTENDERS``
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
+    :param batch: batch size
+    :param width: units of each of the two hidden layers
+    :return: function that makes one gradient step of :func:`make_model`'s model, as ``learn`` does
     """
     model = make_model(contender, sizes, batch, width)
     return lambda: model.train(1, batch)
@@ -110,12 +114,12 @@ def make_step(contender: str, sizes: tuple[int, int, int], batch: int, width: in
 
 def make_baseline_step(name: str, sizes: tuple[int, int, int], batch: int, width: int, compiled: bool) -> Callable[[], None]:
     """
-    :param name: a key of ``BASELINES``
-    :param sizes: partial, privileged, actions
+    :param name: key of ``BASELINES``
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
     :param batch: batch size
-    :param width: of the two hidden layers
-    :param compiled: whether to compile
-    :return: one gradient step, as ``learn`` makes it; of on-policy algorithms one minibatch, which is the whole rollout
+    :param width: units of each of the two hidden layers
+    :param compiled: whether to compile the gradient step
+    :return: function that makes one gradient step, as ``learn`` does; an on-policy algorithm's minibatch is a whole rollout
     """
     algorithm, arguments = BASELINES[name]
     known = constructor_parameters(algorithm)
@@ -137,11 +141,12 @@ def make_baseline_step(name: str, sizes: tuple[int, int, int], batch: int, width
 
 def step_flops(sizes: tuple[int, int, int], batch: int, width: int) -> float:
     """
-    Floating-point operations of the matrix products in one GAC step; gradients that nothing uses are not counted.
+    Floating-point operations of the matrix products in one GAC step, without those of gradients that are not used.
 
-    :param sizes: partial, privileged, actions
-    :param batch: B
-    :param width: H, of both hidden layers
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
+    :param batch: batch size B
+    :param width: units H of each of the two hidden layers
+    :return: number of floating-point operations
     """
     partial, privileged, actions = sizes
     full = partial + privileged
@@ -158,20 +163,24 @@ def step_flops(sizes: tuple[int, int, int], batch: int, width: int) -> float:
 
 
 def matmul_rate(batch: int, width: int) -> float:
-    """Floating-point operations per second of one plain (B, H) x (H, H) product."""
+    """
+    :param batch: batch size B
+    :param width: units H of a layer
+    :return: floating-point operations per second of one plain product of matrices of the shapes (B, H) and (H, H)
+    """
     x, weight = th.randn(batch, width), th.randn(width, width)
     seconds = alternate({"mm": timer(lambda: th.mm(x, weight))}, repetitions=100, rounds=5)["mm"]
     return 2.0 * batch * width * width / float(np.median(seconds))
 
 
 class LoopedGRU(th.nn.GRU):
-    """A GRU as it is without a fused pass over time: one call for each step."""
+    """A GRU without a fused pass over time: it is called once for each step."""
 
     def forward(self, x: th.Tensor, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:  # type: ignore[override]
         """
-        :param x: shape (T, B, F)
-        :param state: shape (1, B, H)
-        :return: shapes (T, B, H) and (1, B, H)
+        :param x: inputs, shape (T, B, F)
+        :param state: hidden state before the first step, shape (1, B, H)
+        :return: outputs, shape (T, B, H), and the hidden state after the last step, shape (1, B, H)
         """
         outputs = []
         for step in x.split(1):
@@ -182,12 +191,13 @@ class LoopedGRU(th.nn.GRU):
 
 def make_recurrent_step(what: str, sizes: tuple[int, int, int], length: int, batch: int, width: int) -> Callable[[], Any]:
     """
-    :param what: "ours"; "looped", with a Python loop over time; "sampling", which is a part of either
-    :param sizes: partial, privileged, number of actions
-    :param length: of the episodes, T
-    :param batch: episodes, B
-    :param width: of all layers
-    :return: one gradient step of GAC with GRUs, or that part
+    :param what: contender: "ours"; "looped", whose GRUs loop over time in Python; or "sampling", the part of a gradient step
+        that samples from the replay buffer
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and number of discrete actions
+    :param length: steps T of each episode
+    :param batch: episodes B in a batch
+    :param width: units of every layer
+    :return: function that makes one gradient step of GAC with GRUs, or that samples for it
     """
     model = sb3_gac.GAC(
         "MultiInputGruPolicy",
@@ -215,8 +225,14 @@ def recurrent_step_flops(sizes: tuple[int, int, int], length: int, batch: int, w
     """
     Floating-point operations of the matrix products in one step of :func:`make_recurrent_step`'s model.
 
-    Policies: forward over T + 1 steps, and twice that backward. Critics: the same for their own loss; once more, frozen, for
-    a policy's; their targets once.
+    A policy has a forward pass over T + 1 steps, and a backward pass that costs twice as much. A critic has the same for its
+    own loss, one more forward pass, frozen, for a policy's loss, and one of its target network.
+
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and number of discrete actions
+    :param length: steps T of each episode
+    :param batch: episodes B in a batch
+    :param width: units of every layer
+    :return: number of floating-point operations
     """
     partial, privileged, actions = sizes
 

@@ -1,4 +1,4 @@
-"""What a person sees of a launch: in a terminal of any size a bar and a table, elsewhere a line for each start and end."""
+"""The display of a launch: a bar and a table in a terminal of any size; elsewhere a line for each start and end of a run."""
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -13,7 +13,7 @@ from benchmarks.finished import name_of
 from benchmarks.jobs import ENDED_BADLY, Clock, Job, count, in_words, last_evaluation
 
 COLUMNS = ("run and seed", "state", "steps", "return")
-_SUMMARY = 2  # lines above the table: the bar, and how many runs are in each state
+_SUMMARY = 2  # lines above the table: the bar, and the number of runs in each state
 _BAR_AT_LEAST = 8  # columns
 _NARROW = 80  # columns, below which steps are a percentage
 _BESIDE_NAMES = 36  # columns for all but the names, 12 of them for the return
@@ -25,11 +25,11 @@ class Row(NamedTuple):
     """
     A line of the table.
 
-    :param cell: the task and the noise
-    :param run: algorithm and seed; of finished runs, the algorithm
-    :param state: of the run, or how many are finished
-    :param steps: at the last evaluation, and those of the whole run
-    :param value: return there, or returns of finished runs; of a run that failed, why
+    :param cell: name of the cell, task and noise
+    :param run: algorithm and seed; for finished runs the algorithm alone
+    :param state: state of the run, or the number of finished runs
+    :param steps: environment steps at the last evaluation, and those of the whole run
+    :param value: mean return at the last evaluation; for finished runs the return of each; for a run that failed the reason
     """
 
     cell: str
@@ -39,7 +39,10 @@ class Row(NamedTuple):
     value: str
 
     def texts(self, width: int) -> tuple[str, str, str, str]:
-        """What is in each column of a terminal of so many, where a cell's name gives way first."""
+        """
+        :param width: columns of the terminal; where there are few, the cell's name is shortened first
+        :return: text in each column of the table
+        """
         done, of_all = self.steps
         steps = f"{done / of_all:.0%}" if width < _NARROW else f"{done:,} / {of_all:,}" if done < of_all else f"{done:,}"
         room = max(width - _BESIDE_NAMES - 12 * (width >= _NARROW), _NAMES_AT_LEAST) - len(self.run) - 1
@@ -49,12 +52,12 @@ class Row(NamedTuple):
 
 class Overview:
     """
-    A bar with the time that is left, how many runs are in each state, and a table as high as the terminal allows, all made
-    anew from the jobs whenever it is drawn.
+    A bar with the time that is left, the number of runs in each state, and a table as high as the terminal allows. All three
+    are made anew from the jobs whenever they are drawn.
 
-    :param jobs: of this launch
-    :param finished_before: runs of the suite that this launch need not make
-    :param clock: for the time that is left, by default one that starts now
+    :param jobs: jobs of the launch
+    :param finished_before: number of the suite's runs that were finished before the launch
+    :param clock: clock that estimates the time that is left, by default one that starts now
     """
 
     def __init__(self, jobs: Sequence[Job], finished_before: int = 0, clock: Clock | None = None):
@@ -62,7 +65,7 @@ class Overview:
         self._clock = clock or Clock(jobs)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Called by rich."""
+        """Yield the parts of the display; called by rich."""
         lines = max((options.height or console.height) - 1, 1)  # the last one is the cursor's
         rows = list(self.rows())
         room = max(lines - _SUMMARY, 0)
@@ -75,7 +78,10 @@ class Overview:
             yield _table([row.texts(options.max_width) for row in shown], [row.state for row in shown], has_header)
 
     def rows(self) -> Iterator[Row]:
-        """The most important ones first: runs that run, that failed, and cells with finished ones, the last to end first."""
+        """
+        Yield the rows of the table, the most important ones first: runs that are running, runs that failed or were not
+        started, and the finished runs of each cell and algorithm, the latest first.
+        """
         for job in self._in_state("running", "failed", "not started"):
             steps, value = last_evaluation(job)
             said = job.reason or why_not_started(job) if job.state in ENDED_BADLY else _in_digits(value)
@@ -87,11 +93,11 @@ class Overview:
             yield Row(*_cell(jobs[0]), f"{len(jobs)} finished", (whole, whole), ", ".join(returns))
 
     def _in_state(self, *states: str) -> list[Job]:
-        """Those in the first of the states first."""
+        """The jobs in the given states, in the order of the states."""
         return [job for state in states for job in self._jobs if job.state == state]
 
     def _bar(self, width: int) -> Table:
-        """The bar, and in words as much as there is room for."""
+        """The bar, beside as much text as there is room for."""
         done, of_all = self._clock.done_of_all()
         share = done / of_all if of_all else 1.0
         left = time_left(self._clock)
@@ -113,7 +119,7 @@ class Overview:
 def _table(rows: Sequence[Sequence[str]], states: Sequence[str], has_header: bool) -> Table:
     table = Table(box=None, show_header=has_header, padding=(0, 2, 0, 0), header_style="dim")
     for column in COLUMNS:
-        table.add_column(column, no_wrap=column != COLUMNS[-1])  # which gives way where there is little room
+        table.add_column(column, no_wrap=column != COLUMNS[-1])  # the last column is shortened first
     for row, state in zip(rows, states, strict=True):
         table.add_row(*(Text(text, no_wrap=True, overflow="ellipsis") for text in row), style=_STYLES.get(state, ""))
     return table
@@ -129,16 +135,16 @@ def _in_digits(value: float | None) -> str:
 
 def table(jobs: Sequence[Job]) -> Overview:
     """
-    :param jobs: of this launch
-    :return: for a terminal
+    :param jobs: jobs of a launch
+    :return: display of the launch for a terminal
     """
     return Overview(jobs)
 
 
 def time_left(clock: Clock) -> str:
     """
-    :param clock: of this launch
-    :return: in words, empty where it can't be told yet
+    :param clock: clock of a launch
+    :return: text with the time that is left, empty before the first evaluation
     """
     seconds = clock.seconds_left()
     return "" if seconds is None else f"{in_words(seconds)} left"
@@ -146,12 +152,12 @@ def time_left(clock: Clock) -> str:
 
 def line(jobs: Sequence[Job], job: Job, clock: Clock) -> str:
     """
-    For a log, where a table can't be drawn anew.
+    Describe an event in one line, for a log, where a table can't be drawn anew.
 
-    :param jobs: of this launch
-    :param job: one of them, whose state has changed, or that is tried again
-    :param clock: of this launch
-    :return: what happened, and how many jobs are in each state now
+    :param jobs: jobs of the launch
+    :param job: job whose state has changed, or that is tried again
+    :param clock: clock of the launch
+    :return: line that says what happened to the job, and how many jobs are in each state
     """
     steps, value = last_evaluation(job)
     ended = job.state != "running" or job.reason
@@ -164,8 +170,8 @@ def line(jobs: Sequence[Job], job: Job, clock: Clock) -> str:
 
 def why_not_started(job: Job) -> str:
     """
-    :param job: in any state
-    :return: of one that was not started, why
+    :param job: job in any state
+    :return: text that names the jobs that this one needs and that failed or were not started; empty if there are none
     """
     verbs = {"failed": "failed", "not started": "was not started"}
     return "".join(f", for it needs {name_of(other.spec)}, which {verbs[other.state]}" for other in job.lacking)

@@ -1,4 +1,4 @@
-"""How fast are environments from pixels, beside the bare simulator and renderer, and gradient steps of a learner on images?"""
+"""The speed of environments from pixels, beside the bare simulator and renderer, and of gradient steps on images."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ SIZE, FRAMES, CAPACITY = 64, 3, 1_000
 
 
 class OneFrame(gym.Env):
-    """Random images and states of HalfCheetah's sizes, in episodes without an end."""
+    """An environment with random images and states of HalfCheetah's sizes, in episodes without an end."""
 
     observation_space = spaces.Dict(
         partial=spaces.Box(0, 255, (3, SIZE, SIZE), np.uint8), privileged=spaces.Box(-np.inf, np.inf, (17,), np.float32)
@@ -30,21 +30,22 @@ class OneFrame(gym.Env):
     action_space = spaces.Box(-1, 1, (6,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """See gymnasium's."""
+        """Return a random observation."""
         super().reset(seed=seed)
         return self.observation_space.sample(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """See gymnasium's."""
+        """Return a random observation, and a reward of 0."""
         return self.observation_space.sample(), 0.0, False, False, {}
 
 
 def compare_pixels(task: str, steps: int, rounds: int) -> dict[str, Any]:
     """
     :param task: one of ``TASKS``
-    :param steps: in a block
-    :param rounds: blocks of each contender
-    :return: steps per second, the bare simulator and renderer's as a multiple of them, and images per second
+    :param steps: environment steps in a block
+    :param rounds: number of blocks of each contender
+    :return: environment steps per second; their rate as a multiple of the rate of the bare simulator and renderer; and images
+        that the renderer alone draws per second
     """
     bare, env = gym.make(f"{task}-v5"), gym.make(f"sb3_gac/{task}Pixels-v5")
     simulator: Any = bare.unwrapped
@@ -70,11 +71,11 @@ def compare_pixels(task: str, steps: int, rounds: int) -> dict[str, Any]:
 
 def compare_image_steps(name: str, steps: int, rounds: int) -> dict[str, Any]:
     """
-    :param name: of an algorithm
+    :param name: name of an algorithm
     :param steps: gradient steps in a block
-    :param rounds: blocks of each contender
-    :return: gradient steps per second with the preset ``pixels`` on one thread, what sampling and random shifts take of them,
-        and the replay buffer's bytes and sampling time over those of SB3's
+    :param rounds: number of blocks of each contender
+    :return: gradient steps per second with the preset ``pixels`` on one thread; the shares of their time that sampling and
+        random shifts take; and the replay buffer's bytes and sampling time as multiples of those of SB3's
     """
     th.set_num_threads(1)
     options = sb3_gac.preset("pixels", algorithm=name) | {"buffer_size": CAPACITY, "learning_starts": 10**9}
@@ -85,7 +86,7 @@ def compare_image_steps(name: str, steps: int, rounds: int) -> dict[str, Any]:
     twice = DictReplayBuffer(CAPACITY, model.observation_space, model.action_space, device="cpu")
     twice.full = True
     for images in (twice.observations["partial"], twice.next_observations["partial"]):
-        images[:] = 1  # memory that nobody wrote to costs nothing to read
+        images[:] = 1  # reading memory that was never written to takes no time
     arrays = [*twice.observations.values(), *twice.next_observations.values()]
     arrays += [twice.actions, twice.rewards, twice.dones, twice.timeouts]
     timers = {
@@ -107,10 +108,22 @@ def compare_image_steps(name: str, steps: int, rounds: int) -> dict[str, Any]:
 
 
 def tabulate_pixels(threads: list[int], quick: bool) -> list[dict[str, Any]]:
-    """Environments from pixels."""
+    """
+    Tabulate the speed of environments from pixels.
+
+    :param threads: numbers of torch's threads, which are not used
+    :param quick: whether to measure one task, in few rounds
+    :return: one row for each task
+    """
     return [compare_pixels(task, 20 if quick else 200, 2 if quick else 9) for task in (TASKS[1:2] if quick else TASKS)]
 
 
 def tabulate_image_steps(threads: list[int], quick: bool) -> list[dict[str, Any]]:
-    """Gradient steps of learners on images."""
+    """
+    Tabulate gradient steps on images.
+
+    :param threads: numbers of torch's threads, which are not used: there is one thread
+    :param quick: whether to measure few rounds
+    :return: one row for each algorithm
+    """
     return [compare_image_steps(name, 1 if quick else 3, 2 if quick else 9) for name in ("asymmetric_sac", "gac")]

@@ -1,4 +1,4 @@
-"""Where the time goes: of a gradient step, and of training as a whole."""
+"""Profiles: how the time of a gradient step, and of training as a whole, divides among its parts."""
 
 import cProfile
 import itertools
@@ -17,15 +17,20 @@ from benchmarks.contenders import timer
 from benchmarks.models import make_model, matmul_rate, step_flops
 
 COMPILED = ("optim/compile.py", "__call__")  # losses, gradients, clipping, optimisers, dual variables and targets
-SAMPLING = ("replay/buffer.py", "sample")  # which no compiled code calls
+SAMPLING = ("replay/buffer.py", "sample")  # no compiled code calls it
 
 
 def profile_step(contender: str, sizes: tuple[int, int, int], batch: int, width: int, steps: int) -> list[dict[str, Any]]:
     """
-    Where the time of a gradient step goes, on one thread.
+    Profile gradient steps of a contender, on one thread.
 
-    :return: parts with their milliseconds and shares, which add up; of compiled code, what its matrix products would take at
-        the rate of a plain one, and the rest
+    :param contender: key of ``CONTENDERS``
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
+    :param batch: batch size
+    :param width: units of each of the two hidden layers
+    :param steps: number of gradient steps
+    :return: one row for each part of a gradient step: "contender", "part", "milliseconds" and "share"; the shares add up to 1.
+        Compiled code is two parts: the time of its matrix products at the rate of a plain product, and the rest of its time
     """
     th.set_num_threads(1)
     model = make_model(contender, sizes, batch, width)
@@ -56,10 +61,10 @@ def profile_step(contender: str, sizes: tuple[int, int, int], batch: int, width:
 
 def cumulative_seconds(stats: pstats.Stats, file: str, function: str) -> float:
     """
-    :param stats: of a profile
-    :param file: end of a file's name
-    :param function: in that file
-    :return: in the function and all that it calls
+    :param stats: statistics of a profile
+    :param file: end of a file's path
+    :param function: name of a function in that file
+    :return: seconds spent in the function and in all functions that it calls
     """
     return sum(
         cumulative
@@ -70,10 +75,12 @@ def cumulative_seconds(stats: pstats.Stats, file: str, function: str) -> float:
 
 def env_step(env: gym.Env, n_actions: int = 100) -> Callable[[], None]:
     """
-    Contenders with the same spaces get the same actions, and so the same physics to compute.
+    Make a step of an environment to time. Environments with the same action space get the same actions, and so the same
+    physics to compute.
 
-    :param env: to step, reset where an episode ends
-    :param n_actions: random actions that are taken over and over
+    :param env: environment to step; it is reset where an episode ends
+    :param n_actions: number of random actions, which are taken over and over
+    :return: function that steps the environment once
     """
     env.action_space.seed(0)
     actions = itertools.cycle([env.action_space.sample() for _ in range(n_actions)])
@@ -88,12 +95,12 @@ def env_step(env: gym.Env, n_actions: int = 100) -> Callable[[], None]:
 
 def profile_rollout(n_envs: int, vec_steps: int) -> dict[str, float]:
     """
-    Where the time of ``learn`` goes on HalfCheetah, with one gradient step per environment step.
+    Measure how the time of ``learn`` divides on HalfCheetah, with one gradient step per environment step.
 
-    :param n_envs: environments side by side
-    :param vec_steps: steps of all of them
-    :return: environment steps per second, and the shares of gradient steps, of physics (with our wrappers, without SB3's
-        vector environment), and of all else
+    :param n_envs: number of environments side by side
+    :param vec_steps: number of steps of the vectorised environment
+    :return: environment steps per second, and the shares of the gradient steps, of the physics (with our wrappers, but without
+        SB3's vectorised environment), and of everything else
     """
     vec_env = make_vec_env("sb3_gac/HalfCheetah-v5", n_envs, seed=0, env_kwargs={"noise_std": 0.1})
     small = {**sb3_gac.preset("small"), "learning_starts": 0, "buffer_size": 50_000, "device": "cpu"}

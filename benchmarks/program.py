@@ -1,4 +1,4 @@
-"""What a program in Python that trains for :mod:`benchmarks.external` is asked for, and how it answers."""
+"""The request to a program in Python that trains for :mod:`benchmarks.external`, and the program's answer."""
 
 import csv
 import io
@@ -18,15 +18,15 @@ from benchmarks.suite import RunSpec
 from sb3_gac.training.environments import make_wrapped
 
 REQUEST, EVALUATIONS = "request.json", "evaluations.csv"
-#: One mapping per evaluation: ``timesteps``, ``learner``, and others
+#: One mapping for each evaluation: ``timesteps``, ``learner``, and perhaps other numbers
 Rows: TypeAlias = list[dict[str, float]]
 
 
 def read_rows(directory: Path) -> Rows:
     """
-    :param directory: of a run
-    :return: its program's evaluations so far
-    :raises ValueError: if there is something else in their place
+    :param directory: directory of a run
+    :return: evaluations that the run's program has made so far
+    :raises ValueError: if the file is no table with the numbers ``timesteps`` and ``learner``
     """
     path = directory / CHECKPOINT / EVALUATIONS
     if not path.exists():
@@ -41,8 +41,8 @@ def read_rows(directory: Path) -> Rows:
 
 def rows_as_text(rows: Rows) -> str:
     """
-    :param rows: at least one
-    :return: as a CSV file
+    :param rows: at least one row
+    :return: text of a CSV file with these rows; the columns are those of the last row
     """
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, rows[-1].keys(), restval="nan")
@@ -53,48 +53,53 @@ def rows_as_text(rows: Rows) -> str:
 
 class Request:
     """
-    :param path: of ``request.json``
+    A run that a program is asked to make.
+
+    :param path: path of ``request.json``
     """
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
         asked = json.loads(self.path.read_text())
-        #: The run's settings
+        #: Settings of the run
         self.spec = RunSpec(**asked["run"])
-        #: The program's own
+        #: The program's own arguments
         self.arguments: dict[str, Any] = asked["arguments"]
-        #: Environment steps at which it evaluates
+        #: Environment steps at which the program evaluates
         self.evaluations: list[int] = asked["evaluations"]
         #: Evaluations so far
         self.rows = read_rows(self.path.parent)
         sys.path += [place for place in asked["path"] if place not in sys.path]
-        #: What the evaluation environments are seeded with
+        #: Seed of the first evaluation environment; the others have the following numbers
         self.eval_seed: int = asked["eval_seed"]
         self._environment = asked["environment"]
         self._eval_env: VecEnv | None = None
 
     @property
     def checkpoint(self) -> Path:
-        """Directory of what the program goes on from, which is removed when the run is finished."""
+        """The directory for the program's own checkpoints; it is removed when the run is finished."""
         return self.path.parent / CHECKPOINT
 
     def make_env(self) -> gym.Env:
-        """One of the run's environments, without a seed."""
+        """Make one of the run's environments, without a seed."""
         return make_wrapped(self._environment["id"], self._environment["kwargs"], self._environment["wrappers"])
 
     def go_on_from(self, timesteps: int) -> None:
         """
-        :param timesteps: of the program's last checkpoint: evaluations after it will be made again
+        Drop the evaluations after a checkpoint, since they will be made again.
+
+        :param timesteps: environment steps at the program's last checkpoint
         """
         self.rows = [row for row in self.rows if row["timesteps"] <= timesteps]
 
     def evaluate(self, timesteps: int, policy: Any) -> float:
         """
-        Evaluate as all algorithms are: the same environments, seeds, and number of episodes. Writes the row.
+        Evaluate a policy with the same environments, seeds and number of episodes as every algorithm, and write the table of
+        evaluations.
 
-        :param timesteps: so far, one of ``evaluations``
-        :param policy: with SB3's ``predict(observation, state, episode_start, deterministic)``
-        :return: mean return
+        :param timesteps: environment steps so far, one of ``evaluations``
+        :param policy: object with SB3's ``predict(observation, state, episode_start, deterministic)``
+        :return: mean return of the episodes
         """
         if self._eval_env is None:
             self._eval_env = make_envs(self.spec, self.spec.eval_episodes)

@@ -1,10 +1,10 @@
 """
-Aggregated results -> a figure in the paper's layout, a page with curves to hover over, and tables in Markdown::
+Draws aggregated results as a figure in the paper's layout and as a page with interactive curves, and prints tables::
 
     python -m benchmarks.report benchmarks/results/halfcheetah
 
-reads ``halfcheetah.csv`` and ``halfcheetah.json`` and writes the figure as ``.png``, ``.pdf`` and ``.svg``, and the page as
-``.html``, beside them.
+The command reads ``halfcheetah.csv`` and ``halfcheetah.json``. Beside them, it writes the figure as ``.png``, ``.pdf`` and
+``.svg``, and the page as ``.html``. The tables are in Markdown.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from benchmarks.page.plots import (
     steps_label,
     title_of,
 )
-from benchmarks.page.plots import interactive as interactive  # the returns of the page, as a figure of plotly's
+from benchmarks.page.plots import interactive as interactive  # the plot of returns on the page, a figure of plotly
 from benchmarks.tidy import NEEDED, read_tidy, with_needed_steps
 
 matplotlib.use("Agg")
@@ -43,10 +43,10 @@ FORMATS = ("png", "pdf", "svg")
 
 def draw(tidy: pd.DataFrame, paths: Sequence[Path]) -> None:
     """
-    Tasks across, noises down; mean and interval of the learner, dashes the guider.
+    Draw the figure: tasks across, noises down; the learner's mean with its interval, and the guider's mean in dashes.
 
-    :param tidy: as aggregated
-    :param paths: of the picture, whose suffixes are its formats
+    :param tidy: aggregated evaluations
+    :param paths: files of the figure; a suffix names the file's format
     """
     tasks, noises, algorithms = grid(tidy)
     size = (4.2 * len(tasks), 3.0 * len(noises))
@@ -81,7 +81,7 @@ def draw(tidy: pd.DataFrame, paths: Sequence[Path]) -> None:
 
 
 def _legend_below(figure: Figure, lines: Mapping[str, Artist]) -> None:
-    """As many names side by side as the figure is wide."""
+    """Put a legend below the axes, with as many names side by side as the figure has room for."""
     for columns in range(len(lines), 0, -1):
         legend = figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=columns, fontsize="small")
         if legend.get_window_extent().width <= figure.bbox.width:
@@ -92,8 +92,8 @@ def _legend_below(figure: Figure, lines: Mapping[str, Artist]) -> None:
 
 def cells_table(cells: list[dict[str, Any]]) -> str:
     """
-    :param cells: as aggregated
-    :return: Markdown
+    :param cells: "cells" of the aggregated results: one mapping for each algorithm in each cell
+    :return: Markdown table of the final returns
     """
     head = ("task", "noise", "algorithm", "learner, each seed", "mean", "IQM [95%]", "guider", "KL / target: min, mean, max")
     rows = []
@@ -115,8 +115,8 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
 
 def overall_table(results: dict[str, Any]) -> str:
     """
-    :param results: as aggregated
-    :return: Markdown
+    :param results: aggregated results
+    :return: Markdown table of the comparisons over all cells
     """
     sections = (("normalised_iqm", "normalised IQM"), ("probability_of_improvement", "probability of improvement"))
     rows = [
@@ -129,15 +129,16 @@ def overall_table(results: dict[str, Any]) -> str:
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """
-    :param head: column names
-    :param rows: as many texts each
+    :param head: names of the columns
+    :param rows: rows, each with one text for each column
+    :return: Markdown table
     """
     lines = [tuple(head), tuple("---" for _ in head), *map(tuple, rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def main() -> None:
-    """Command line."""
+    """Entry point of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, help="path of the results, without a suffix")
     parser.add_argument(

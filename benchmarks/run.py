@@ -1,9 +1,9 @@
 """
-One training run -> one directory::
+Makes one training run of a suite, in a directory of its own::
 
     python -m benchmarks.run --suite benchmarks/suites/halfcheetah.yml --index 0 --runs benchmarks/runs
 
-A finished run is skipped; an unfinished one goes on from its last checkpoint, which is made after every evaluation.
+A finished run is skipped. An unfinished one goes on from its last checkpoint; there is one after every evaluation.
 The directory holds ``evaluations.csv`` if and only if the run is finished.
 """
 
@@ -39,11 +39,13 @@ RECORDING = "recording.npz"
 
 def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     """
-    :param spec: of the run
+    Train, or go on with training, unless the run is finished.
+
+    :param spec: settings of the run
     :param root: directory of all runs
-    :param progress_bar: whether to show one
+    :param progress_bar: whether to show a progress bar
     :return: the run's directory
-    :raises RuntimeError: if another process is running it
+    :raises RuntimeError: if another process is making this run
     :raises ValueError: if its directory holds a run with another configuration, or a run that it needs is not finished
     """
     directory = spec.directory(root)
@@ -68,10 +70,12 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
 
 def file_for(argument: str, spec: RunSpec, root: Path) -> Path:
     """
-    :param argument: of a run that needs another one: ``recording`` is what that one has recorded, any other its model
-    :param spec: of the other run
+    :param argument: algorithm's argument that stands for another run's file: ``recording`` for the run's recorded actions and
+        rewards, any other name for its model
+    :param spec: settings of the other run
     :param root: directory of all runs
-    :raises ValueError: if it is not there
+    :return: path of that file
+    :raises ValueError: if the other run is not finished, or its file is gone
     """
     path = spec.directory(root) / (RECORDING if argument == "recording" else MODEL)
     if not spec.is_finished(root):
@@ -82,7 +86,7 @@ def file_for(argument: str, spec: RunSpec, root: Path) -> Path:
 
 
 def _refuse_other_settings(path: Path, algorithm_class: type, configuration: dict[str, Any]) -> None:
-    """What was written by a process that did not come to the end must have been the same: two runs are never mixed."""
+    """Refuse to go on with an unfinished run that was begun with other settings: two runs are never mixed."""
     if path.exists():
         before = yaml.safe_load(path.read_text())
         now, then = (_comparable(algorithm_class, one) for one in (configuration, before))
@@ -92,7 +96,7 @@ def _refuse_other_settings(path: Path, algorithm_class: type, configuration: dic
 
 
 def _comparable(algorithm_class: type, configuration: dict[str, Any]) -> dict[str, Any]:
-    """With arguments by their present names."""
+    """The configuration with its arguments by their present names, so that two can be compared."""
     arguments = in_present_names(algorithm_class, configuration.get("arguments") or {})
     run = settings_in_present_names(algorithm_class, configuration.get("run") or {})
     return {**configuration, "run": UNSAID | run, "arguments": arguments}
@@ -102,9 +106,13 @@ def _write_configuration(
     path: Path, configuration: dict[str, Any], resumed: bool, versions: Mapping[str, str] = MappingProxyType({})
 ) -> None:
     """
-    With the commit and versions of this process, and, if it goes on where others stopped, theirs where they differ.
+    Write the configuration with the commit and the versions of this process. If this process goes on with a run, those of the
+    earlier processes are kept wherever they differ.
 
-    :param versions: of what another process trains with
+    :param path: YAML file of the configuration
+    :param configuration: settings of the run and arguments of its algorithm
+    :param resumed: whether an earlier process began this run
+    :param versions: package -> version, of a program that trains in a process of its own
     """
     now = provenance()
     now["versions"] = {**now["versions"], **versions}
@@ -115,12 +123,12 @@ def _write_configuration(
 
 class Stopwatch(BaseCallback):
     """
-    Seconds and steps from a run's start to its last evaluation, in whatever processes, and that evaluation's return: what a
-    killed one did afterwards is done again, and not counted.
+    Writes the seconds and steps from a run's start to its last evaluation, over all of its processes, and the return of that
+    evaluation. Steps that a killed process made after its last evaluation are made again, so they do not count.
 
-    :param path: JSON file
-    :param evaluation: called before this one
-    :param resumed: whether the file's seconds and steps come first
+    :param path: JSON file to write
+    :param evaluation: callback that evaluates; it is called before this one
+    :param resumed: whether the run goes on, so that the seconds in the file are added
     """
 
     def __init__(self, path: Path, evaluation: sb3_gac.SeededEvalCallback, resumed: bool):
@@ -134,7 +142,7 @@ class Stopwatch(BaseCallback):
         return True
 
     def write(self) -> None:
-        """Replace the file."""
+        """Replace the file by one for the last evaluation."""
         learner = float(self._evaluation.history[-1]["learner"])
         write_timing(self._path, self._before + time.time() - self._started, self.model.num_timesteps, learner)
 
@@ -148,8 +156,15 @@ def _train(
     progress_bar: bool,
 ) -> list[dict[str, float]]:
     """
-    :param models: argument -> file of the model that it is
-    :return: one row per evaluation
+    Train an algorithm of this package or of SB3's in this process.
+
+    :param spec: settings of the run
+    :param directory: directory of the run
+    :param algorithm_class: class of the algorithm
+    :param configuration: ``arguments`` of the algorithm, and ``normalize`` if observations or rewards are normalised
+    :param models: argument of the algorithm -> file of the model that it stands for
+    :param progress_bar: whether to show a progress bar
+    :return: one row for each evaluation
     """
     options = configuration.get("normalize")
     env = normalized(make_envs(spec, spec.envs, spec.seed), options)
@@ -186,29 +201,37 @@ def _train(
 
 
 def _run_program(spec: RunSpec, directory: Path, program: Program, configuration: dict[str, Any]) -> list[dict[str, float]]:
-    """:return: one row per evaluation"""
+    """
+    Start a program that trains in a process of its own, and wait for its end.
+
+    :param spec: settings of the run
+    :param directory: directory of the run
+    :param program: the program
+    :param configuration: settings and arguments to record
+    :return: one row for each evaluation
+    """
     resumed = bool(read_rows(directory))
     _write_configuration(directory / CONFIGURATION, configuration, resumed, program.versions())
     return program.run(spec, directory)
 
 
 def _evaluation_class(algorithm_class: type) -> type[sb3_gac.SeededEvalCallback]:
-    """An algorithm with a guider has it evaluated beside what is deployed."""
+    """The class of the evaluation callback: where an algorithm has a guider, the guider is evaluated beside the learner."""
     return sb3_gac.GuiderLearnerEvalCallback if hasattr(algorithm_class, "predict_guider") else sb3_gac.SeededEvalCallback
 
 
 def write_evaluations(history: list[dict[str, float]], path: Path) -> None:
     """
-    Written last and in one move: the file exists if and only if the run is finished.
+    Write the table of evaluations. It is written last and in one move, so that it exists if and only if the run is finished.
 
-    :param history: one row per evaluation
-    :param path: CSV file
+    :param history: one row for each evaluation
+    :param path: CSV file to write
     """
     write_atomically(path, rows_as_text(history))
 
 
 def main() -> None:
-    """Command line."""
+    """Entry point of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suite", type=Path, required=True)
     parser.add_argument("--index", type=int, required=True, help="which run of the suite, see launch --dry-run")

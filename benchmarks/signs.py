@@ -1,12 +1,12 @@
 """
-The pictures of docs/signs.md, from committed results::
+Draws the pictures of docs/signs.md from committed results::
 
     python -m benchmarks.launch benchmarks/suites/signs.yml
     python -m benchmarks.aggregate benchmarks/suites/signs.yml --out benchmarks/results/signs
     python -m benchmarks.signs
 
-writes ``benchmarks/results/signs-<name>.png``, each with healthy runs behind sick ones, and prints what they show. Pictures
-whose results are not there are named, and left out.
+The last command writes ``benchmarks/results/signs-<name>.png``, each with healthy runs behind sick ones, and prints the last
+values of both. A picture whose results are missing is named, and not drawn.
 """
 
 import argparse
@@ -27,10 +27,10 @@ from matplotlib.ticker import MaxNLocator
 
 class Runs(NamedTuple):
     """
-    One algorithm in one cell of some results.
+    The runs of one algorithm in one cell.
 
     :param results: name of the results, in ``benchmarks/results``
-    :param algorithm: its name in the suite
+    :param algorithm: name of the algorithm in the suite
     :param task: title of the cell's task
     :param noise: standard deviation of the cell's sensor noise
     """
@@ -42,8 +42,8 @@ class Runs(NamedTuple):
 
     def read(self, folder: Path) -> pd.DataFrame:
         """
-        :param folder: of all results
-        :return: evaluations of all seeds, none if there are no such results
+        :param folder: folder of all results
+        :return: evaluations of all seeds, an empty table if there are no such results
         """
         path = folder / f"{self.results}.csv"
         if not path.exists():
@@ -54,11 +54,11 @@ class Runs(NamedTuple):
 
 class Picture(NamedTuple):
     """
-    Sick runs with healthy ones behind them.
+    A picture of sick runs, with healthy ones behind them.
 
-    :param label: what is wrong
-    :param healthy: runs in grey
-    :param sick: runs in red
+    :param label: name of the fault, as the legend shows it
+    :param healthy: healthy runs, drawn in grey
+    :param sick: sick runs, drawn in red
     """
 
     label: str
@@ -68,7 +68,7 @@ class Picture(NamedTuple):
 
 PENDULUM = ("Pendulum-history4", 0.2)
 HEALTHY = Runs("signs", "gac", *PENDULUM)
-#: Name in the file -> what it shows
+#: Name in the picture's file -> picture
 PICTURES = {
     "target-kl-too-large": Picture("target_kl too large", HEALTHY, Runs("signs", "gac-kl-too-large", *PENDULUM)),
     "target-kl-too-small": Picture("target_kl too small", HEALTHY, Runs("signs", "gac-kl-too-small", *PENDULUM)),
@@ -83,7 +83,7 @@ PICTURES = {
         "no memory", Runs("memory", "gac-gru", "Pendulum", 0.05), Runs("memory", "gac", "Pendulum", 0.05)
     ),
 }
-#: Column of the results, or what is made of two -> title of its axes
+#: Column of the results, or a quantity made of two columns -> title of its axes
 PANELS = {
     "returns": "return: learner, and guider dashed",
     "ratio": "train/kl over train/target_kl",
@@ -96,12 +96,12 @@ GREY, RED = "#8a8a8a", "#d62728"
 
 def draw(label: str, healthy: pd.DataFrame, sick: pd.DataFrame, path: Path) -> None:
     """
-    One panel beside the other: what the logs of sick runs show, and of healthy ones.
+    Draw the quantities that the logs of healthy and of sick runs show, in panels side by side.
 
-    :param label: what is wrong
+    :param label: name of the fault, as the legend shows it
     :param healthy: evaluations of healthy runs
-    :param sick: evaluations of sick ones
-    :param path: of the picture
+    :param sick: evaluations of sick runs
+    :param path: file of the picture
     """
     panels = [panel for panel in PANELS if panel != "learner_mean_abs" or panel in sick]
     figure, axes = plt.subplots(1, len(panels), figsize=(3.2 * len(panels), 2.9), layout="constrained")
@@ -124,7 +124,7 @@ def draw(label: str, healthy: pd.DataFrame, sick: pd.DataFrame, path: Path) -> N
 
 
 def _plot(axis: Axes, panel: str, run: pd.DataFrame, color: str, label: str | None) -> None:
-    """:param run: evaluations of one seed"""
+    """Add the curve of a run, the evaluations of one seed, to a panel; the panel of returns has the guider's curve too."""
     if panel == "returns":
         axis.plot(run.timesteps, run.learner, color=color, label=label)
         axis.plot(run.timesteps, run.guider, color=color, linestyle="--")
@@ -136,7 +136,7 @@ def _plot(axis: Axes, panel: str, run: pd.DataFrame, color: str, label: str | No
 def described(runs: pd.DataFrame) -> str:
     """
     :param runs: evaluations of one algorithm in one cell
-    :return: what the last evaluation of each seed found
+    :return: text with the values of each seed's last evaluation
     """
     last = runs.sort_values("timesteps").groupby("seed").tail(1)
     found = {
@@ -151,7 +151,7 @@ def described(runs: pd.DataFrame) -> str:
 
 
 def main() -> None:
-    """Command line."""
+    """Entry point of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?", default=HERE / "results", help="with all results")
     folder = parser.parse_args().folder

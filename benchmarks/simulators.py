@@ -1,13 +1,14 @@
 """
-Steps per second of registered environments, beside those of the simulator alone::
+Measures steps per second of registered environments, beside those of the simulator alone::
 
     python -m benchmarks.simulators Go1JoystickFlatTerrain HalfCheetah --envs 1 16 128
 
-All take turns, a few milliseconds each, so that whatever else the machine does slows down all.  An overhead is the median over
-the turns of how much more processor time the process takes, which waits for no other process; what the clock says is there
-too, and what the fastest turn of each needs, which no other process disturbed.  "Alone" is EnvPool's own ``step`` for tasks of
-EnvPool, and otherwise the innermost environments' one after the other, without a wrapper.  "In SB3" are those in gymnasium's
-and SB3's own wrappers and a ``DummyVecEnv``, as without this package.
+All contenders take turns of a few milliseconds, so that other work of the machine slows all of them alike.  An overhead is
+the additional processor time of a step, as a median over the turns; processor time leaves out the waiting for other processes.
+The additional time by the clock is printed too, and the time of each contender's fastest turn, which no other process
+disturbed.  The simulator "alone" is EnvPool's own ``step`` for tasks of EnvPool, and for others the innermost environments,
+stepped one after the other without a wrapper.  "In SB3" are the same simulators in gymnasium's and SB3's own wrappers and a
+``DummyVecEnv``, as without this package.
 """
 
 import argparse
@@ -38,11 +39,11 @@ COLUMNS += ["us at best: all, alone, in SB3"]
 
 class Overhead(NamedTuple):
     """
-    Time per step that another way of stepping does not need, as a share of what it needs.
+    Additional time of a step over another way of stepping, as a share of the other's time.
 
-    :param median: over the turns
-    :param low: a quarter of the turns is below
-    :param high: a quarter of them is above
+    :param median: median over the turns
+    :param low: lower quartile over the turns
+    :param high: upper quartile over the turns
     """
 
     median: float
@@ -55,16 +56,18 @@ class Overhead(NamedTuple):
 
 class Speed(NamedTuple):
     """
-    Of environments side by side.
+    The speed of environments side by side.
 
-    :param steps_per_second: of all together, with everything that SB3 needs, by the clock
-    :param in_sb3: without this package's wrappers; None for simulators that step a batch, which SB3 has nothing for
-    :param alone: the simulator's
-    :param overhead: over the simulator alone, in processor time of the process, all of its threads together
-    :param overhead_by_clock: the same as the clock has it, which on a busy machine says little
-    :param overhead_in_sb3: over ``in_sb3``, in processor time
-    :param microseconds: of the processor for a step of one environment in the fastest turn: with everything, alone, in SB3
-    :param turns: that were measured
+    :param steps_per_second: steps per second of all environments together, as an algorithm steps them, by the clock
+    :param in_sb3: steps per second without this package's wrappers; ``None`` for simulators that step a batch, for
+        which SB3 has no vectorised environment
+    :param alone: steps per second of the simulator alone
+    :param overhead: overhead over the simulator alone, in processor time of all threads of the process
+    :param overhead_by_clock: overhead over the simulator alone by the clock, which says little on a busy machine
+    :param overhead_in_sb3: overhead over ``in_sb3`` in processor time, ``None`` where that is ``None``
+    :param microseconds: microseconds of processor time for a step of one environment in the fastest turn: with everything, of
+        the simulator alone, and in SB3 if it was measured
+    :param turns: number of turns that were measured
     """
 
     steps_per_second: float
@@ -79,8 +82,9 @@ class Speed(NamedTuple):
 
 def measure(env: VecEnv, seconds: float) -> Speed:
     """
-    :param env: reset
-    :param seconds: to measure for, or longer, until there are nine turns
+    :param env: vectorised environment that has been reset
+    :param seconds: seconds to measure for; the measurement lasts longer if it needs to for nine turns
+    :return: speed of the environment
     """
     actions = np.stack([env.action_space.sample() for _ in range(env.num_envs)])
     ways = [lambda: env.step(actions), simulator_step(env, actions)]
@@ -92,7 +96,7 @@ def measure(env: VecEnv, seconds: float) -> Speed:
     end = time.perf_counter() + seconds
     while len(turns) < MIN_TURNS or time.perf_counter() < end:
         turns.append([_times(way, n_calls) for way in ways])
-    by_clock, by_processor = np.array(turns).T  # (ways, turns) each
+    by_clock, by_processor = np.array(turns).T  # each of shape (ways, turns)
     whole, alone, *in_sb3 = (env.num_envs / np.median(by_clock, axis=1)).tolist()
     return Speed(
         whole,
@@ -107,7 +111,7 @@ def measure(env: VecEnv, seconds: float) -> Speed:
 
 
 def _times(call: Callable[[], Any], times: int) -> tuple[float, float]:
-    """Seconds of one call, on average, by the clock and of the processor."""
+    """The mean seconds of a call, by the clock and in processor time."""
     clock, processor = time.perf_counter(), time.process_time()
     for _ in range(times):
         call()
@@ -121,10 +125,10 @@ def _overhead(ours: np.ndarray, theirs: np.ndarray) -> Overhead:
 
 def simulator_step(env: VecEnv, actions: np.ndarray) -> Callable[[], Any]:
     """
-    :param env: reset
-    :param actions: one for each environment
-    :return: a step of all environments without what is around the simulator, which begins new episodes by itself
-    :raises ValueError: if the simulator is not within reach
+    :param env: vectorised environment that has been reset
+    :param actions: actions, one for each environment
+    :return: function that steps all simulators without the wrappers around them, and begins new episodes where one ends
+    :raises ValueError: if the environment is of a kind whose simulator cannot be reached
     """
     if isinstance(env, BatchVecEnv):
         pool = getattr(env, "pool", None)
@@ -148,7 +152,7 @@ def _innermost(env: DummyVecEnv) -> list[gym.Env]:
 
 
 def _in_sb3(env: DummyVecEnv) -> DummyVecEnv:
-    """The same simulators as SB3's ``make_vec_env`` would have them."""
+    """The same simulators in the wrappers that SB3's ``make_vec_env`` would put around them."""
     limits = [one.spec.max_episode_steps if one.spec else None for one in env.envs]
 
     def made(one: gym.Env, limit: int | None) -> Callable[[], gym.Env]:
@@ -162,9 +166,10 @@ def _in_sb3(env: DummyVecEnv) -> DummyVecEnv:
 
 def measured(env_id: str, n_envs: int, seconds: float) -> Speed:
     """
-    :param env_id: of a registered environment
-    :param n_envs: side by side
-    :param seconds: to measure for
+    :param env_id: id of a registered environment
+    :param n_envs: number of environments side by side
+    :param seconds: seconds to measure for
+    :return: speed of the environments
     """
     env = make_vec(env_id, n_envs, seed=0)
     try:
@@ -176,9 +181,9 @@ def measured(env_id: str, n_envs: int, seconds: float) -> Speed:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """
-    Command line.
+    Entry point of the command line.
 
-    :param arguments: by default the process's
+    :param arguments: command-line arguments, by default those of the process
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="+", help="as in sb3_gac/<task>-v<version>")
@@ -203,7 +208,7 @@ def _in_words(speed: Speed) -> list[str]:
 
 
 def _write(path: Path, env_id: str, n_envs: int, speed: Speed) -> None:
-    """Each measurement as soon as it is made."""
+    """Add a measurement to the file."""
     found = json.loads(path.read_text()) if path.exists() else {}
     one = {name: _rounded(value) for name, value in speed._asdict().items() if value is not None}
     found.setdefault("columns of overheads", ["median", "lower quartile", "upper quartile"])

@@ -1,11 +1,11 @@
 """
-Training that is killed at random moments, again and again, and goes on from its last checkpoint::
+Kills training at random moments, again and again, and lets it go on from its last checkpoint::
 
     python -m benchmarks.soak /tmp/soak --minutes 60 --out benchmarks/results/soak.json
 
-A worker trains GAC on HalfCheetah and makes checkpoints; this program ends it by SIGKILL or SIGTERM after a random time and
-starts it again.  What it reports: steps lost by each kill, memory at the start and the end, and whether the networks in the
-end are those of training that nobody disturbed, to the bit.
+A worker trains GAC on HalfCheetah and makes checkpoints; this program ends the worker by SIGKILL or SIGTERM after a random
+time and starts it again.  The report has the steps lost by each kill, the memory at the start and at the end, and whether the
+networks at the end are, to the bit, those of training without a kill.
 """
 
 import argparse
@@ -33,9 +33,9 @@ FOREVER = 10**8
 
 class ProgressCallback(BaseCallback):
     """
-    Adds a line to a file for every so many steps: steps done, memory in MB.
+    Adds a line to a file at the start and every few calls: the event, environment steps so far, and memory in MB.
 
-    :param path: of the file
+    :param path: file to append to
     :param every: calls between two lines
     """
 
@@ -59,12 +59,13 @@ class ProgressCallback(BaseCallback):
 
 def work(directory: Path, steps: int, interval: int, seed: int) -> None:
     """
-    Train to the end, or go on with training.
+    Train, or go on with training from the last checkpoint.
 
-    :param directory: of this run; "end.json" says where the last process ended that was not killed
-    :param steps: of all its processes together
-    :param interval: between two checkpoints
-    :param seed: of everything random
+    :param directory: directory of the run; its "end.json" has the steps and the networks at the end of the last process that
+        was not ended by SIGKILL
+    :param steps: environment steps of the whole run, over all of its processes
+    :param interval: environment steps between two checkpoints
+    :param seed: seed of everything random
     """
     th.set_num_threads(1)
     env = make_vec_env("sb3_gac/HalfCheetah-v5", ENVS, seed=seed, env_kwargs={"noise_std": 0.1})
@@ -89,13 +90,15 @@ def disturb(
     directory: Path, arguments: list[str], until: float, least: int, pause: tuple[float, float], seed: int
 ) -> list[str]:
     """
-    :param directory: of a run
-    :param arguments: of its worker
-    :param until: time of the last kill, which is one by SIGTERM
-    :param least: kills that there are in any case, however long they take
-    :param pause: shortest and longest time between two kills, in seconds of training
-    :param seed: of the moments and of the signals
-    :return: the signals that ended it
+    Run a worker, and kill and restart it until a given time.
+
+    :param directory: directory of the run
+    :param arguments: command-line arguments of the worker
+    :param until: time from which on a kill is the last one, in seconds since the epoch; the last kill is by SIGTERM
+    :param least: least number of kills, however long they take
+    :param pause: shortest and longest time between a start and its kill, in seconds of training
+    :param seed: seed of the moments and the signals
+    :return: names of the signals that ended the workers
     :raises RuntimeError: if a worker ends by itself
     """
     generator = random.Random(seed)
@@ -127,8 +130,8 @@ def _starts(directory: Path) -> int:
 
 def losses(lines: list[str]) -> list[int]:
     """
-    :param lines: of "progress.csv": event, steps, memory
-    :return: for each start but the first, the steps that had been made before and were made again
+    :param lines: lines of "progress.csv": event, steps, memory
+    :return: number of environment steps that were lost and made again, one for each start but the first
     """
     lost, furthest = [], 0
     for line in lines:
@@ -140,7 +143,7 @@ def losses(lines: list[str]) -> list[int]:
 
 
 def main() -> None:
-    """Command line."""
+    """Entry point of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("directory", type=Path)
     parser.add_argument("--minutes", type=float, default=60, help="during which it is disturbed")
@@ -164,8 +167,10 @@ def main() -> None:
 
 def soak(options: argparse.Namespace) -> dict[str, Any]:
     """
-    :param options: of the command line
-    :return: what happened
+    Disturb one run, make the same run undisturbed, and compare the two.
+
+    :param options: options of the command line
+    :return: content of the report
     """
     started = time.time()
     disturbed, undisturbed = options.directory / "disturbed", options.directory / "undisturbed"

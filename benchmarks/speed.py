@@ -1,11 +1,11 @@
 """
-How fast is a gradient step, and how large the buffer, beside SB3's SAC in the same run::
+Measures gradient steps, replay buffers and other costs, beside those of SB3's SAC in the same run::
 
     python -m benchmarks.speed --out benchmarks/results/speed [--threads 1 2] [--tables steps growth] [--quick]
 
-The contenders alternate in blocks, each in a process of its own; ratios are medians of the blocks' ratios.  The limit is
-that of the arithmetic: the step's matrix products at the rate of a plain one, timed in the same run.  Steps and buffers use
-only spaces and sizes of the tasks, with random data; the rollout is that of HalfCheetah itself.
+The contenders alternate in blocks, each in a process of its own; a ratio is the median of the blocks' ratios.  The limit of a
+gradient step is the rate of its matrix products alone, each as fast as a plain product that is timed in the same run.
+Gradient steps and buffers have the sizes of the tasks' spaces and random data; the rollout is one of HalfCheetah itself.
 """
 
 import argparse
@@ -55,7 +55,14 @@ def compare_steps(
     names: Iterable[str], sizes: tuple[int, int, int], batch: int, width: int, threads: int, rounds: int
 ) -> dict[str, float]:
     """
-    :return: gradient steps per second of SB3's SAC, those of each contender as a multiple, and GAC's shares of the limit
+    :param names: contenders, keys of ``CONTENDERS``, with "sac" among them
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
+    :param batch: batch size
+    :param width: units of each of the two hidden layers
+    :param threads: number of torch's threads
+    :param rounds: number of blocks of each contender
+    :return: gradient steps per second of SB3's SAC; the rate of each other contender as a multiple of SAC's, "_over_sac"; and
+        the rates of GAC's contenders as shares of the limit, "_share_of_limit"
     """
     repetitions = max(1, min(BLOCK, BLOCK * 256**3 // (batch * width**2)))
     with process_timers(make_step, {name: (name, sizes, batch, width) for name in names}, threads) as timers:
@@ -75,9 +82,15 @@ def compare_baselines(
     names: Iterable[str], sizes: tuple[int, int, int], batch: int, width: int, rounds: int
 ) -> list[dict[str, Any]]:
     """
-    With one thread, in processor time.
+    Measure gradient steps with one thread, in processor time.
 
-    :return: of each contender, milliseconds of a gradient step, and its rate as a multiple of that of SB3's SAC; compiled too
+    :param names: algorithms, keys of ``BASELINES``, with "sac" among them
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
+    :param batch: batch size
+    :param width: units of each of the two hidden layers
+    :param rounds: number of blocks of each contender
+    :return: one row for each algorithm, compiled and not: milliseconds of a gradient step, and its rate as a multiple of the
+        rate of SB3's SAC
     """
     arguments = {(name, compiled): (name, sizes, batch, width, compiled) for name in names for compiled in (False, True)}
     del arguments["sac", True]
@@ -97,14 +110,24 @@ def compare_baselines(
 
 
 def median_ratio(numerators: list[float], denominators: list[float]) -> float:
-    """Of two contenders' blocks, taken side by side."""
+    """
+    :param numerators: seconds of one contender, one number for each block
+    :param denominators: seconds of another contender in the same blocks
+    :return: median over the blocks of the ratio of the two
+    """
     return float(np.median(np.array(numerators) / np.array(denominators)))
 
 
 def compare_recurrent(batch: int, width: int, threads: int, rounds: int) -> dict[str, float]:
     """
-    :return: gradient steps per second of GAC with GRUs on RepeatPreviousEasy's sizes, as a multiple of a Python loop over
-        time, and their share of the limit; sampling's share of their time
+    Measure gradient steps of GAC with GRUs, on the sizes of RepeatPreviousEasy.
+
+    :param batch: episodes in a batch
+    :param width: units of every layer
+    :param threads: number of torch's threads
+    :param rounds: number of blocks of each contender
+    :return: gradient steps per second, their rate as a multiple of the rate with a Python loop over time, their rate as a
+        share of the limit, and the share of their time that sampling takes
     """
     arguments = {name: (name, (8, 5, 4), 51, batch, width) for name in ("ours", "looped", "sampling")}
     with process_timers(make_recurrent_step, arguments, threads) as timers:
@@ -121,7 +144,11 @@ def compare_recurrent(batch: int, width: int, threads: int, rounds: int) -> dict
 
 def compare_buffers(sizes: tuple[int, int, int], batch: int = 256, capacity: int = 20_000) -> dict[str, float]:
     """
-    :return: bytes and sampling time of the compact buffer over those of SB3's
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
+    :param batch: transitions in a sample
+    :param capacity: capacity of both replay buffers, in transitions
+    :return: bytes and sampling time of the compact replay buffer as multiples of those of SB3's, and its sampling time in
+        microseconds
     """
     env = SpacesOnly(*sizes)
     assert isinstance(env.observation_space, spaces.Dict)
@@ -147,7 +174,9 @@ def compare_buffers(sizes: tuple[int, int, int], batch: int = 256, capacity: int
 
 def compare_wrappers(rounds: int = ROUNDS) -> dict[str, float]:
     """
-    :return: microseconds of a HalfCheetah step, gymnasium's and ours with noise, and what ours adds as a share
+    :param rounds: number of blocks of each environment
+    :return: microseconds of a step of gymnasium's HalfCheetah and of ours with sensor noise, and the time that ours adds as a
+        share of gymnasium's
     """
     envs = {"gymnasium": gym.make("HalfCheetah-v5"), "ours": gym.make("sb3_gac/HalfCheetah-v5", noise_std=0.1)}
     seconds = alternate({name: timer(env_step(env)) for name, env in envs.items()}, repetitions=1_000, rounds=rounds)
@@ -159,8 +188,13 @@ def compare_wrappers(rounds: int = ROUNDS) -> dict[str, float]:
 
 def compare_deployment(sizes: tuple[int, int, int], width: int, rounds: int) -> dict[str, float]:
     """
-    :return: processor time, with one thread: microseconds of one action from one observation by SB3 SAC's ``predict``, by
-        GAC's, and by the exported learner; milliseconds until its file is loaded
+    Measure how long a policy takes for one action, with one thread, in processor time.
+
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
+    :param width: units of each of the two hidden layers
+    :param rounds: number of blocks of each contender
+    :return: microseconds of one action from one observation by ``predict`` of SB3's SAC, by that of GAC, and by the
+        exported learner; the ratio of the first to the last; and milliseconds to load the exported file
     """
     th.set_num_threads(1)
     gac, sac = (make_model(name, sizes, 256, width) for name in ("gac", "sac"))
@@ -186,8 +220,10 @@ def compare_deployment(sizes: tuple[int, int, int], width: int, rounds: int) -> 
 
 def compare_checkpoints(sizes: tuple[int, int, int], width: int, capacity: int, more: int) -> dict[str, float]:
     """
-    :param capacity: transitions in a full replay buffer
-    :param more: transitions until the next checkpoint
+    :param sizes: sizes of the entries ``partial`` and ``privileged``, and of an action
+    :param width: units of each of the two hidden layers
+    :param capacity: capacity of the replay buffer in transitions; it is full at the first checkpoint
+    :param more: number of transitions between the first checkpoint and the next one
     :return: seconds and megabytes of a first checkpoint, of the next one, and of SB3's ``save`` and ``save_replay_buffer``
     """
     gac, sac = (make_model(name, sizes, 256, width, buffer_size=capacity) for name in ("gac", "sac"))
@@ -207,7 +243,7 @@ def compare_checkpoints(sizes: tuple[int, int, int], width: int, capacity: int, 
 
 
 def _fill(buffer: Any, steps: int) -> None:
-    """With random transitions of one environment, episodes of 1,000 steps."""
+    """Add transitions of one environment to a replay buffer, in episodes of 1,000 steps."""
     obs = {key: box.sample()[None] for key, box in buffer.observation_space.items()}
     action = buffer.action_space.sample()[None]
     for step in range(steps):
@@ -218,7 +254,9 @@ def _fill(buffer: Any, steps: int) -> None:
 
 def _writing(write: Callable[[], Any], directory: Path) -> tuple[float, float]:
     """
-    :return: seconds of ``write``, and megabytes of the files that it wrote in the directory
+    :param write: function that writes files
+    :param directory: directory in which it writes them
+    :return: seconds of ``write``, and megabytes of the files that it wrote
     """
     before = {path: path.stat().st_ino for path in directory.rglob("*")}
     start = time.perf_counter()
@@ -229,7 +267,13 @@ def _writing(write: Callable[[], Any], directory: Path) -> tuple[float, float]:
 
 
 def tabulate_steps(threads: list[int], quick: bool) -> list[dict[str, Any]]:
-    """Gradient steps: HalfCheetah with one thread, all sizes with more."""
+    """
+    Tabulate gradient steps: those of HalfCheetah's sizes with one thread, those of all sizes with more.
+
+    :param threads: numbers of torch's threads
+    :param quick: whether to measure one size, in few rounds
+    :return: one row for each setting
+    """
     rows = []
     for count in threads:
         several = count > 1 and not quick
@@ -241,7 +285,13 @@ def tabulate_steps(threads: list[int], quick: bool) -> list[dict[str, Any]]:
 
 
 def tabulate_growth(threads: list[int], quick: bool) -> list[dict[str, Any]]:
-    """Gradient steps by batch, width and size of the privileged entry, with the last number of threads."""
+    """
+    Tabulate gradient steps by batch size, width and size of the entry ``privileged``.
+
+    :param threads: numbers of torch's threads, of which the last is used
+    :param quick: whether to measure one setting alone
+    :return: one row for each setting
+    """
     rows = []
     for batch, width, privileged in GROWTH[:1] if quick else GROWTH:
         row = {"threads": threads[-1], "batch": batch, "width": width, "privileged": privileged}
@@ -250,7 +300,13 @@ def tabulate_growth(threads: list[int], quick: bool) -> list[dict[str, Any]]:
 
 
 def tabulate_rollout(threads: list[int], quick: bool) -> list[dict[str, Any]]:
-    """Where training's time goes, by number of environments, with the last number of threads."""
+    """
+    Tabulate how the time of training divides among its parts, by number of environments.
+
+    :param threads: numbers of torch's threads, of which the last is used
+    :param quick: whether to measure few steps
+    :return: one row for each number of environments
+    """
     th.set_num_threads(threads[-1])
     rows = []
     for n_envs in ENVS:
@@ -260,7 +316,13 @@ def tabulate_rollout(threads: list[int], quick: bool) -> list[dict[str, Any]]:
 
 
 def tabulate_recurrent(threads: list[int], quick: bool) -> list[dict[str, Any]]:
-    """Gradient steps of GAC with GRUs on whole episodes."""
+    """
+    Tabulate gradient steps of GAC with GRUs on whole episodes.
+
+    :param threads: numbers of torch's threads
+    :param quick: whether to measure one small width, in few rounds
+    :return: one row for each number of threads and width
+    """
     widths = (16,) if quick else (64, 256)
     rows = [(count, width) for count in threads for width in widths]
     return [
@@ -269,7 +331,7 @@ def tabulate_recurrent(threads: list[int], quick: bool) -> list[dict[str, Any]]:
     ]
 
 
-TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name -> threads, whether to be quick -> rows
+TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name -> function of threads and quick -> rows
     "wrappers": lambda threads, quick: [compare_wrappers(3 if quick else 10 * ROUNDS)],
     "steps": tabulate_steps,
     "baselines": lambda threads, quick: compare_baselines(BASELINES, SIZES["HalfCheetah"], 256, 256, 3 if quick else ROUNDS),
@@ -292,14 +354,15 @@ TABLES: dict[str, Callable[[list[int], bool], list[dict[str, Any]]]] = {  # name
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """
-    :param rows: with the same keys
+    :param rows: at least one row, all with the same keys
+    :return: Markdown table of the rows
     """
     lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
     return "\n".join([*lines, *("| " + " | ".join(str(value) for value in row.values()) + " |" for row in rows)])
 
 
 def main() -> None:
-    """Command line."""
+    """Entry point of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])

@@ -1,4 +1,4 @@
-"""A suite: which algorithms, on which tasks, at which noise levels, with which seeds. Read from YAML, checked by name."""
+"""Suites: a YAML file names algorithms, tasks, noise levels and seeds; it is read into training runs, every key checked."""
 
 import re
 import sys
@@ -22,33 +22,33 @@ _SHARED_KEYS = {"algorithms", "seeds", "needs"}
 _TASK_KEYS = {"task", "noises", "history", *_SHARED_KEYS}
 _ENV_KEYS = {"env", "env_kwargs", "wrappers", "name", *_SHARED_KEYS}
 NAME = re.compile(r"\w[\w.+-]*")
-#: Settings that runs of earlier versions had without saying so
+#: Settings that runs of earlier versions had without recording them
 UNSAID = {"eval_deterministic": True}
-_WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # other digits may be in quotes for a reason
+_WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # other numbers may be in quotes on purpose
 
 
 @dataclass(frozen=True)
 class RunSpec:
     """
-    One training run.
+    The settings of one training run.
 
-    :param algorithm: a name in ``hyperparams/algorithms.yml``, or in the suite's own ``algorithms``
-    :param task: as in ``sb3_gac/<task>-v<version>``, or the name of any other environment
-    :param noise: standard deviation of the sensor noise, ``None`` for an environment that is not asked for one
-    :param seed: of everything random
-    :param steps: environment steps
-    :param envs: environments side by side
-    :param preset: a name in ``sb3_gac/presets``, the arguments to start from
-    :param eval_every: environment steps between evaluations
-    :param eval_episodes: of each evaluation
+    :param algorithm: name of the algorithm in ``hyperparams/algorithms.yml``, or in the suite's own ``algorithms``
+    :param task: task name, as in ``sb3_gac/<task>-v<version>``, or the name of any other environment
+    :param noise: standard deviation of the sensor noise, ``None`` for an environment that takes no such argument
+    :param seed: seed of everything random
+    :param steps: environment steps of training
+    :param envs: number of environments side by side
+    :param preset: name of the preset in ``sb3_gac/presets`` whose arguments are the first layer
+    :param eval_every: environment steps between two evaluations
+    :param eval_episodes: number of episodes of each evaluation
     :param overrides: arguments of the algorithm that replace those of the preset
-    :param environment: ``id``, ``kwargs`` and ``wrappers`` of one that is no registered task
-    :param definition: of the algorithm, where the suite has it
-    :param history: observations that ``partial`` holds, with the actions between them; ``None`` for the newest alone
+    :param environment: ``id``, ``kwargs`` and ``wrappers`` of the environment, ``None`` for a registered task
+    :param definition: definition of the algorithm, ``None`` for the one in ``hyperparams/algorithms.yml``
     :param needs: argument of the algorithm -> ``algorithm``, ``steps``, ``definition`` and ``needs`` of the run whose model
-        that argument is
-    :param eval_deterministic: whether evaluations take the policies' likeliest actions, and not samples; programs of their own
-        evaluate as they do
+        that argument is; ``None`` if the run needs no other
+    :param history: number of observations that ``partial`` holds, with the actions between them; ``None`` for the newest alone
+    :param eval_deterministic: whether evaluations use the deterministic policy instead of sampled actions; an algorithm that
+        is a program of its own decides by itself
     """
 
     algorithm: str
@@ -69,23 +69,26 @@ class RunSpec:
 
     @property
     def title(self) -> str:
-        """What figures, tables and files call the task."""
+        """The task's name in figures, tables and files; it names the history too."""
         return self.task if self.history is None else f"{self.task}-history{self.history}"
 
     @property
     def cell(self) -> str:
-        """What a directory is called after, for all algorithms and seeds."""
+        """The name of the cell, task and noise, which the runs of all its algorithms and seeds share."""
         return self.title if self.noise is None else f"{self.title}-noise{self.noise:g}"
 
     def directory(self, root: Path) -> Path:
-        """Where this run's files go."""
+        """
+        :param root: directory of all runs
+        :return: directory of this run's files
+        """
         return root / f"{self.preset}-{self.steps}" / self.cell / self.algorithm / f"seed{self.seed}"
 
     def is_finished(self, root: Path) -> bool:
         """
         :param root: directory of all runs
-        :return: whether this run is there, from its start to its end
-        :raises ValueError: if what is there is a run with other settings
+        :return: whether this run has been finished there
+        :raises ValueError: if the directory holds a finished run with other settings
         """
         directory = self.directory(root)
         if not (directory / "evaluations.csv").exists():
@@ -99,8 +102,9 @@ class RunSpec:
 
 def needed_runs(spec: RunSpec) -> dict[str, RunSpec]:
     """
-    :param spec: of a run
-    :return: argument of its algorithm -> the run whose model it is: of the same task and seed, with the same settings
+    :param spec: settings of a run
+    :return: argument of its algorithm -> settings of the run whose model that argument is: the same task, seed and other
+        settings, but for the algorithm and the steps
     """
     needs = spec.needs or {}
     return {argument: replace(spec, **{"definition": None, "needs": None} | need) for argument, need in needs.items()}
@@ -108,8 +112,8 @@ def needed_runs(spec: RunSpec) -> dict[str, RunSpec]:
 
 def with_needed(specs: Iterable[RunSpec]) -> Iterator[RunSpec]:
     """
-    :param specs: of runs
-    :return: each after those that it needs
+    :param specs: settings of runs
+    :return: settings of these runs and of all that they need, each after those that it needs
     """
     for spec in specs:
         yield from with_needed(needed_runs(spec).values())
@@ -118,8 +122,8 @@ def with_needed(specs: Iterable[RunSpec]) -> Iterator[RunSpec]:
 
 def needed_steps(spec: RunSpec) -> int:
     """
-    :param spec: of a run
-    :return: environment steps of all runs that must come before it, each counted once
+    :param spec: settings of a run
+    :return: environment steps of all runs that must come before this one, each run counted once
     """
     before = {needed.directory(Path()): needed.steps for needed in with_needed(needed_runs(spec).values())}
     return sum(before.values())
@@ -127,27 +131,27 @@ def needed_steps(spec: RunSpec) -> int:
 
 def made_with(configuration: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
-    :param configuration: a run's ``config.yaml``
-    :return: commit and versions of the processes that made it, more than one if they differ
+    :param configuration: content of a run's ``config.yaml``
+    :return: commit and versions of the processes that made the run, one entry for each distinct combination
     """
     return [*configuration.get("earlier", []), {key: configuration[key] for key in ("commit", "versions")}]
 
 
 def read_suite(path: Path) -> list[RunSpec]:
     """
-    :param path: YAML file
-    :return: its runs; all seeds of a cell before the next cell
-    :raises ValueError: if a key is unknown or missing
+    :param path: YAML file of a suite
+    :return: settings of its runs, all seeds of a cell before the next cell
+    :raises ValueError: if a key is unknown or missing, or a run is listed twice
     """
     return [spec for cell in read_cells(path) for spec in cell]
 
 
 def read_cells(path: Path) -> list[list[RunSpec]]:
     """
-    Modules that a suite names are found beside it as well, from now on.
+    Read a suite, and put its folder on Python's path, so that modules beside the suite can be imported.
 
-    :param path: YAML file
-    :return: its runs, by entry of its ``cells`` and noise
+    :param path: YAML file of a suite
+    :return: settings of its runs: one list for each noise of each entry of ``cells``
     :raises ValueError: if a key is unknown or missing, or a run is listed twice
     """
     try:
@@ -190,15 +194,17 @@ def _check_distinct(name: str, specs: list[RunSpec]) -> None:
 
 
 def read_definitions() -> dict[str, Any]:
-    """Name -> definition, of ``hyperparams/algorithms.yml``: class, arguments, and what it needs."""
+    """The content of ``hyperparams/algorithms.yml``: algorithm's name -> its class, arguments, and the runs that it needs."""
     definitions: dict[str, Any] = yaml.safe_load((HYPERPARAMS / "algorithms.yml").read_text())
     return definitions
 
 
 class _Reader:
     """
-    :param name: of a suite's file, for messages
-    :param suite: its content, of which the numbers were checked
+    A suite's content, turned into runs.
+
+    :param name: name of the suite's file, for messages
+    :param suite: content of the file, whose numbers have been checked
     """
 
     def __init__(self, name: str, suite: dict[str, Any]):
@@ -215,7 +221,7 @@ class _Reader:
             check_is(f"{where}, {algorithm}", definition, "a mapping", Mapping)
 
     def cells(self) -> list[list[RunSpec]]:
-        """By entry of ``cells`` and noise."""
+        """The settings of all runs: one list for each noise of each entry of ``cells``."""
         return [runs for number, cell in enumerate(self._suite["cells"], 1) for runs in self._by_noise(number, cell)]
 
     def _by_noise(self, number: int, cell: Any) -> Iterator[list[RunSpec]]:
@@ -244,7 +250,7 @@ class _Reader:
             ]
 
     def _environment(self, where: str, cell: Any) -> tuple[dict[str, Any] | None, str, list[float | None]]:
-        """One that is no registered task, if it is none; its name, and its noises."""
+        """The cell's environment, ``None`` for a registered task; its name; and its noises."""
         if "env" in cell:
             check_keys(where, cell, _ENV_KEYS, {"env", "algorithms", "seeds"})
             environment, name = read_environment(where, cell), cell.get("name", default_name(cell["env"]))
@@ -257,7 +263,7 @@ class _Reader:
         return None, cell["task"], [float(noise) for noise in cell["noises"]]
 
     def _particulars(self, where: str, cell: Any) -> dict[str, dict[str, Any]]:
-        """Each algorithm's definition, if it is the suite's, and what it needs."""
+        """For each algorithm, the definition that the suite has of it, and the runs that it needs."""
         changes = cell.get("needs", {})
         check_is(f"{where}, needs", changes, "a mapping", Mapping)
         if unknown := sorted(set(changes) - set(cell["algorithms"])):
@@ -273,7 +279,7 @@ class _Reader:
     def _needs(
         self, where: str, name: str, steps: int, changes: Mapping[str, Any], above: tuple[str, ...] = ()
     ) -> dict[str, dict[str, Any]] | None:
-        """What an algorithm needs, with the cell's changes, and what that needs in turn."""
+        """The runs that an algorithm needs, with the cell's changes, each with the runs that it needs in turn."""
         if name in above:
             raise ValueError(f"{where}: {' needs '.join([*above, name])}, and so on for ever.")
         defined = (self._definitions.get(name) or {}).get("needs", {})
@@ -303,10 +309,11 @@ def _checked(where: str, argument: str, needs: Mapping[str, Any]) -> Mapping[str
 
 def read_environment(where: str, cell: Mapping[str, Any]) -> dict[str, Any]:
     """
-    :param where: for the message
-    :param cell: with ``env``, and ``env_kwargs`` and ``wrappers`` if it has them
-    :return: ``id``, ``kwargs`` and ``wrappers``: one mapping each, from ``module:Class`` to keyword arguments
-    :raises ValueError: if one of them is something else
+    :param where: place in the file, with which an error message begins
+    :param cell: mapping with ``env``, and perhaps ``env_kwargs`` and ``wrappers``
+    :return: ``id``, ``kwargs`` and ``wrappers`` of the environment; a wrapper is a mapping from its ``module:Class`` to its
+        keyword arguments
+    :raises ValueError: if one of the three has another type or form
     """
     check_is(f"{where}, env", cell["env"], "an id, as in CartPole-v1 or my_module:MyEnv-v0", str, len)
     kwargs, wrappers = cell.get("env_kwargs", {}), cell.get("wrappers", [])
@@ -325,8 +332,8 @@ def read_environment(where: str, cell: Mapping[str, Any]) -> dict[str, Any]:
 
 def default_name(env_id: Any) -> str:
     """
-    :param env_id: of an environment
-    :return: what it is called without a name: its id, without a module
+    :param env_id: id of an environment
+    :return: name of an environment to which the suite gives none: its id without the module
     """
     return str(env_id).rpartition(":")[2].replace("/", "-")
 

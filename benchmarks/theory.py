@@ -1,9 +1,9 @@
 """
-The figure of docs/theory.md, computed anew in seconds::
+Computes and draws the figure of docs/theory.md, in seconds::
 
     python -m benchmarks.theory
 
-writes ``benchmarks/results/theory.png`` and prints what it shows.
+The command writes ``benchmarks/results/theory.png`` and prints the values in the figure.
 """
 
 import argparse
@@ -28,9 +28,11 @@ DOCS = Path(__file__).parent / "results/theory.png"
 
 def learners_end(alpha: float, step: str) -> tuple[float, float]:
     """
+    Solve TigerDoor by guided policy iteration.
+
     :param alpha: weight of the KL
-    :param step: the learner's
-    :return: after guided policy iteration on TigerDoor: the learner's probability to listen first, and its return
+    :param step: learner's improvement step, a key of ``ITERATIONS``
+    :return: learner's probability to listen first, and the learner's expected return
     """
     process = tabular.tiger_door()
     count = ITERATIONS[step]
@@ -40,8 +42,8 @@ def learners_end(alpha: float, step: str) -> tuple[float, float]:
 
 def pulls_and_gradients(targets: np.ndarray) -> np.ndarray:
     """
-    :param targets: of the KL, shape (N,)
-    :return: norms of the pull and of the guider's critic's gradient, and the norm of their difference, shape (N, 3)
+    :param targets: targets of the KL, shape (N,)
+    :return: norm of the pull, norm of the gradient of the guider's critic, and norm of the difference of the two, shape (N, 3)
     """
     learner, std, best = np.array([0.0, 0.0]), np.array([0.2, 0.4]), np.array([1.0, -0.5])
     curvature = np.array([[2.0, 0.5], [0.5, 1.0]])
@@ -55,7 +57,7 @@ def pulls_and_gradients(targets: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    """Computes, prints and draws."""
+    """Entry point of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=DOCS, help="the figure (default: that of docs/theory.md)")
     out = parser.parse_args().out

@@ -1,11 +1,11 @@
 """
-Gradient steps per second of this checkout beside those of another one, in alternation::
+Compares the speed of gradient steps of this checkout with that of another one, in alternation::
 
     git worktree add ../before v1.0
     python -m benchmarks.versus ../before --out benchmarks/results/versus.json
 
-Each checkout's models are in a process of their own, and only one of them works at a time. The ratio of a pair of measurements
-that follow each other stands whatever else the machine does; its median and quartiles over all pairs are what is written.
+Each checkout has its model in a process of its own, and only one process works at a time. Other work of the machine slows both
+measurements of a pair alike, since they follow each other. The results are the median and the quartiles of the pairs' ratios.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from sb3_gac.training.provenance import provenance
 
 HERE = Path(__file__).resolve().parent.parent
 SIZES = {"128 units, batch 128": (128, 128), "256 units, batch 256": (256, 256), "512 units, batch 256": (512, 256)}
-#: What each process runs: it reads a number of gradient steps a line, and answers with the seconds that each took
+#: Program of each process: it reads lines with a number of gradient steps, and answers with the mean seconds of a step
 PROGRAM = """
 import sys, time, warnings
 warnings.simplefilter("ignore")
@@ -46,10 +46,11 @@ for line in sys.stdin:
 
 class Contender:
     """
-    A model of one checkout, in a process.
+    A model of one checkout, in a process of its own.
 
-    :param checkout: directory
-    :param arguments: of ``PROGRAM``
+    :param checkout: directory of the checkout
+    :param arguments: arguments of ``PROGRAM``: algorithm, width, batch size, threads, whether to compile, and clock
+    :raises RuntimeError: if the process ends, or imports the package of another checkout
     """
 
     def __init__(self, checkout: Path, arguments: Sequence[Any]):
@@ -72,8 +73,8 @@ class Contender:
 
     def seconds(self, steps: int) -> float:
         """
-        :param steps: gradient steps
-        :return: of each
+        :param steps: number of gradient steps to make
+        :return: mean seconds of a gradient step
         """
         assert self._process.stdin is not None
         self._process.stdin.write(f"{steps}\n")
@@ -89,11 +90,12 @@ class Contender:
 
 def compare(other: Path, arguments: Sequence[Any], steps: int, pairs: int) -> dict[str, float]:
     """
-    :param other: checkout
-    :param arguments: of ``PROGRAM``
+    :param other: directory of the other checkout
+    :param arguments: arguments of ``PROGRAM``
     :param steps: gradient steps of each measurement
-    :param pairs: of measurements
-    :return: milliseconds of a step here and there, medians; quartiles of how many times as fast this checkout is
+    :param pairs: number of pairs of measurements
+    :return: median milliseconds of a gradient step in this checkout and in the other; and the quartiles of the ratio, which is
+        above 1 where this checkout is faster
     """
     contenders = [Contender(checkout, arguments) for checkout in (HERE, other)]
     times = np.array([[contender.seconds(steps) for contender in contenders] for _ in range(pairs + 1)])[1:]
@@ -107,8 +109,8 @@ def compare(other: Path, arguments: Sequence[Any], steps: int, pairs: int) -> di
 
 def commit(checkout: Path) -> str:
     """
-    :param checkout: directory
-    :return: its commit
+    :param checkout: directory of a checkout
+    :return: abbreviated hash of the checkout's commit
     """
     return subprocess.run(
         ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
@@ -117,9 +119,9 @@ def commit(checkout: Path) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """
-    Command line.
+    Entry point of the command line.
 
-    :param arguments: by default the process's
+    :param arguments: command-line arguments, by default those of the process
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkout", type=Path, help="directory of the other one")

@@ -1,4 +1,4 @@
-"""What YAML has read, against what was meant: errors that name the file's key."""
+"""Checks of values that were read from YAML, with errors that name the key in the file."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 
 def check_list(where: str, values: Any, what: str, kinds: type | tuple[type, ...]) -> None:
     """
-    :param where: for the message
-    :param values: read from YAML
-    :param what: each of them must be, for the message
-    :param kinds: types that each may have
-    :raises ValueError: if there are none, or one is something else
+    :param where: file and key, with which an error message begins
+    :param values: value that was read from YAML
+    :param what: description of the elements, for an error message, such as "whole numbers"
+    :param kinds: types that an element may have
+    :raises ValueError: if the value is no list, if the list is empty, or if an element has another type or is a number below 0
     """
     check_is(where, values, f"a list of at least one of {what}", list, len)
     for value in values:
@@ -19,9 +19,10 @@ def check_list(where: str, values: Any, what: str, kinds: type | tuple[type, ...
 
 def check_numbers(where: str, value: Any, is_meant: Callable[[Any], Any] | None = None) -> None:
     """
-    :param where: for the message
-    :param value: arguments, or what they hold
-    :param is_meant: whether a value must have been meant as a number, :func:`is_number_as_text` by default
+    :param where: file and key, with which an error message begins
+    :param value: arguments, or any value in them; mappings and lists are searched
+    :param is_meant: function that says whether a value must have been meant as a number; by default
+        :func:`is_number_as_text`
     :raises ValueError: naming a number that YAML reads as text
     """
     if (is_meant or is_number_as_text)(value):
@@ -35,12 +36,12 @@ def check_is(
     where: str, value: Any, what: str, kinds: type | tuple[type, ...], holds: Callable[[Any], Any] = lambda value: True
 ) -> None:
     """
-    :param where: for the message
-    :param value: read from YAML
-    :param what: it must be, for the message
-    :param kinds: types that it may have
-    :param holds: what else must be so
-    :raises ValueError: if it is something else
+    :param where: file and key, with which an error message begins
+    :param value: value that was read from YAML
+    :param what: description of an allowed value, for an error message
+    :param kinds: types that the value may have; a boolean is never allowed
+    :param holds: function of the value that must be true as well
+    :raises ValueError: if the value is not allowed
     """
     if isinstance(value, bool) or not isinstance(value, kinds) or not holds(value):
         hint = f" YAML reads {value!r} as text: write a number out, or as 1.0e-3." if is_number_as_text(value) else ""
@@ -49,7 +50,8 @@ def check_is(
 
 def is_number_as_text(value: Any) -> bool:
     """
-    :param value: read from YAML, in whose version 1.1 1e-3 is no number and 1.0e-3 is one
+    :param value: value that was read from YAML
+    :return: whether the value is a text that Python reads as a number: in YAML 1.1, ``1e-3`` is text and ``1.0e-3`` a number
     """
     if not isinstance(value, str):
         return False
@@ -62,10 +64,10 @@ def is_number_as_text(value: Any) -> bool:
 
 def check_keys(where: str, mapping: Mapping[str, Any], known: set[str], required: set[str]) -> None:
     """
-    :param where: for the message
-    :param mapping: read from YAML
-    :param known: keys that it may have
-    :param required: keys that it must have
+    :param where: file and key, with which an error message begins
+    :param mapping: mapping that was read from YAML
+    :param known: keys that the mapping may have
+    :param required: keys that the mapping must have
     :raises ValueError: if a key is unknown or missing
     """
     unknown, missing = sorted(set(mapping) - known), sorted(required - set(mapping))

@@ -1,4 +1,4 @@
-"""Goals and sparse rewards: hindsight experience replay for a robot arm whose velocities only training sees."""
+"""Goals and sparse rewards: hindsight experience replay for a robot arm whose velocities are visible in training only."""
 
 import argparse
 
@@ -10,7 +10,7 @@ from sb3_gac import GAC
 
 
 def main(steps: int = 5_000) -> None:
-    """Train with SB3's replay buffer of goals, which asks the environment what reward another goal would have had."""
+    """Train with SB3's replay buffer for goals, which asks the environment for the rewards that other goals would have had."""
     env = gymnasium.make("sb3_gac/FetchReach-v4", goal_entries=True)
     model = GAC(
         "MultiInputPolicy",

@@ -1,4 +1,4 @@
-"""A memory for the deployed policy alone: a pendulum whose velocity only training sees."""
+"""A memory for the deployed policy alone: a pendulum whose velocity is visible in training only."""
 
 import argparse
 
@@ -18,7 +18,7 @@ def main(steps: int = 15_000) -> None:
         buffer_size=steps,
         learning_starts=min(1_000, steps // 2),
         learning_rate=1e-3,
-        batch_size=16,  # sequences of 16 steps that count, after 16 that bring the memory up
+        batch_size=16,  # sequences of 16 steps to train on, after 16 steps of burn-in
         replay_buffer_kwargs={"sequence_length": 16, "burn_in": 16},
         policy_kwargs={"net_arch": [64], "rnn_type": {"partial": "gru"}, "rnn_hidden_size": 32, "rnn_net_arch": [64]},
         role_keys={"critic": ["privileged"]},
@@ -29,7 +29,7 @@ def main(steps: int = 15_000) -> None:
     mean, std = evaluate_policy(model, env, n_eval_episodes=8)
     print(f"return {mean:.0f} +- {std:.0f} (about -150 swings up and balances, -1000 does not)")
 
-    observation, state = env.reset(), None  # what acting with a memory looks like, step by step
+    observation, state = env.reset(), None  # acting with a memory, step by step
     for _ in range(3):
         action, state = model.predict({"partial": observation["partial"]}, state=state, deterministic=True)
         observation, _, _, _ = env.step(action)

@@ -1,4 +1,4 @@
-"""From a simulator of one's own to a file for the robot: a cart sees a noisy position, and in training its velocity too."""
+"""From your own simulator to a file for the robot: a cart sees a noisy position, and in training its velocity too."""
 
 import argparse
 from pathlib import Path
@@ -13,7 +13,7 @@ from sb3_gac.envs import History, SensorNoise
 
 
 class Cart(gym.Env):
-    """Bring a cart to rest at 0. ``partial`` is what its sensor sees, ``privileged`` all that the simulator knows."""
+    """Bring a cart to rest at 0. ``partial`` is the value of its sensor, ``privileged`` the whole state of the simulator."""
 
     def __init__(self) -> None:
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -36,17 +36,17 @@ class Cart(gym.Env):
 
 
 def make_env() -> gym.Env:
-    """The cart with a noisy sensor, four of whose values the policy sees."""
+    """Make the cart with a noisy sensor, whose last four values the policy sees."""
     return gym.wrappers.TimeLimit(History(SensorNoise(Cart(), noise_std=0.02), length=4, actions=True), 100)
 
 
 def main(steps: int = 20_000, out: Path = Path("cart.onnx")) -> None:
-    """Train, export, and ask the file what to do."""
+    """Train, export the learner, and take an action from the exported file."""
     env = make_vec_env(make_env, n_envs=4, seed=0)
     model = GAC("MultiInputPolicy", env, seed=0, **preset("small", buffer_size=steps, learning_starts=min(1_000, steps // 2)))
     model.learn(steps)
     export_learner(model, out)
-    robot = OnnxPolicy.load(out)  # needs numpy and onnxruntime alone
+    robot = OnnxPolicy.load(out)  # only needs numpy and onnxruntime
     observation = env.reset()
     print("the robot does", robot.act(observation["partial"]))
 

@@ -1,4 +1,4 @@
-"""A teacher that sees everything: cloned before training, with DAgger, and then left behind."""
+"""A teacher that sees everything: the student clones it before training, with DAgger, and then trains without it."""
 
 import argparse
 
@@ -9,7 +9,7 @@ from sb3_gac.envs import make_vec
 
 
 def main(steps: int = 20_000) -> None:
-    """Train a teacher on the full state, clone what of it can be done from one noisy position, and train on."""
+    """Train a teacher on the full state, clone it from a noisy partial observation, and go on training the clone."""
     task, noise = "HalfCheetah", 0.1
     env = make_vec(f"sb3_gac/{task}-v5", 4, seed=0, noise_std=noise)
     setting = {"algorithm": "asymmetric_sac", "task": task, "noise": noise}

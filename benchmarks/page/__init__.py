@@ -1,1 +1,1 @@
-"""The page of a suite's results: one file of HTML that needs nothing else."""
+"""The page of a suite's results: one HTML file that needs no other file."""

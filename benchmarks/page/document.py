@@ -1,4 +1,4 @@
-"""The page itself."""
+"""The HTML document of a page, put together from summary, plots and tables."""
 
 import html
 import json
@@ -19,11 +19,11 @@ HERE = Path(__file__).parent
 
 def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> str:
     """
-    :param tidy: as aggregated
-    :param results: as aggregated
-    :param title: of the page
-    :param runs: directory of all runs, as seen from the page: where its links to logs go
-    :return: HTML that needs nothing else
+    :param tidy: aggregated evaluations
+    :param results: aggregated results
+    :param title: title of the page
+    :param runs: directory of all runs, relative to the page, to which the page's links to logs point
+    :return: HTML of the page, which needs no other file
     """
     seconds = {name: run["seconds"] for name, run in results["runs"].items() if run.get("seconds")}
     drawn = plots(tidy, seconds, normalised_returns(results))
@@ -40,9 +40,9 @@ def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> 
 
 def document(title: str, body: str) -> str:
     """
-    :param title: of the page
-    :param body: HTML, with :func:`tabs` in it
-    :return: a page that draws them, and sorts tables
+    :param title: title of the page
+    :param body: HTML of the page's body, which contains :func:`tabs`
+    :return: HTML of a page whose script draws the plots and sorts tables
     """
     style, script = ((HERE / name).read_text() for name in ("page.css", "page.js"))
     return (
@@ -55,8 +55,9 @@ def document(title: str, body: str) -> str:
 
 def normalised_returns(results: dict[str, Any]) -> pd.DataFrame:
     """
-    :param results: as aggregated
-    :return: a row for each run of the algorithms that are compared over all cells: "algorithm", "normalised"
+    :param results: aggregated results
+    :return: table with one row for each run of the algorithms that are compared over all cells: "algorithm", and the
+        "normalised" final return
     """
     compared = results["compared"]
     scales = {(cell["task"], cell["noise"]): cell for cell in compared["cells"]}
@@ -72,8 +73,8 @@ def normalised_returns(results: dict[str, Any]) -> pd.DataFrame:
 
 def tabs(drawn: Sequence[Plot]) -> str:
     """
-    :param drawn: at least one
-    :return: HTML: plots behind buttons; the page's script draws the chosen one
+    :param drawn: at least one plot
+    :return: HTML of a row of buttons, one for each plot; the page's script draws the plot that is chosen
     """
     figures = {one.name: _as_data(one) for one in drawn}
     buttons = "".join(
@@ -88,7 +89,7 @@ def tabs(drawn: Sequence[Plot]) -> str:
 
 
 def _as_data(plot: Plot) -> dict[str, Any]:
-    """Curves once; they are the same at either width."""
+    """A plot's data for the page's script; the curves are written once, since they are the same at either width."""
     wide, narrow = (json.loads(figure.to_json()) for figure in (plot.wide, plot.narrow))
     return {"data": wide["data"], "wide": wide["layout"], "narrow": narrow["layout"], "caption": plot.caption}
 
@@ -102,7 +103,7 @@ def _notes() -> str:
 
 
 def _origin(results: dict[str, Any]) -> str:
-    """Command, differences of arguments, what is shared, and what it was made with."""
+    """The HTML with the command, the arguments in which algorithms differ, the settings that they share, and the versions."""
     differing, shared = differences_table(results["arguments"]) if "arguments" in results else ("", {})
     settings = yaml.safe_dump({**results.get("settings", {}), "arguments of all": shared}, sort_keys=False)
     known = ("made_with", "mixed_runs", "cpus", "hours", "timed_runs", "seconds_per_run", "particulars", "still_to_run")

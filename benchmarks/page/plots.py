@@ -1,4 +1,4 @@
-"""Curves of a suite's results to hover over and switch off."""
+"""Interactive plots of a suite's results, whose curves can be switched off."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -25,10 +25,10 @@ class Plot(NamedTuple):
     """
     One tab of the page.
 
-    :param name: on the tab
-    :param wide: for a desktop
-    :param narrow: for a phone; the same curves, one cell below the other
-    :param caption: what is seen, and how
+    :param name: label of the tab
+    :param wide: figure for a desktop
+    :param narrow: figure for a phone, with the same curves, one cell below the other
+    :param caption: explanation of the plot
     """
 
     name: str
@@ -39,10 +39,10 @@ class Plot(NamedTuple):
 
 def curves(group: pd.DataFrame, column: str = "learner") -> pd.DataFrame:
     """
-    :param group: one algorithm in one cell
-    :param column: what to average
-    :return: indexed by environment steps: mean over seeds, and the ends of its interval of 95% by Student's t, which for
-        three seeds is 4.3 standard errors to either side; of a single seed there is none, and the ends are the mean
+    :param group: evaluations of one algorithm in one cell
+    :param column: name of the column to average
+    :return: table indexed by environment steps: "mean" over seeds, and "low" and "high", the ends of its 95% interval by
+        Student's t, which for three seeds is 4.3 standard errors to either side; for a single seed both ends are the mean
     """
     rows = {step: mean_interval(of_seeds.dropna().to_numpy()) for step, of_seeds in group.groupby("timesteps")[column]}
     found = pd.DataFrame(rows, index=["mean", "low", "high"]).T
@@ -52,40 +52,44 @@ def curves(group: pd.DataFrame, column: str = "learner") -> pd.DataFrame:
 def steps_label(tidy: pd.DataFrame) -> str:
     """
     :param tidy: aggregated evaluations
-    :return: what its timesteps are
+    :return: label of the axis of environment steps
     """
     return WITH_NEEDED if NEEDED in tidy else STEPS
 
 
 def title_of(task: str, noise: float) -> str:
     """
-    :param task: of a cell
-    :param noise: of a cell
-    :return: the cell's title
+    :param task: title of the cell's task
+    :param noise: standard deviation of the cell's sensor noise, or ``NO_NOISE``
+    :return: title of the cell
     """
     return task if noise == NO_NOISE else f"{task}, noise {noise:g}"
 
 
 def is_wanted(tidy: pd.DataFrame, task: str, noise: float) -> bool:
     """
-    :param tidy: as aggregated
-    :param task: of a cell
-    :param noise: of a cell
-    :return: whether there is, or could be, such a cell: tasks with a noise and tasks without one share a figure
+    :param tidy: aggregated evaluations
+    :param task: title of the cell's task
+    :param noise: standard deviation of the cell's sensor noise, or ``NO_NOISE``
+    :return: whether such a cell exists or could exist; a figure of tasks with and without sensor noise has places for other
+        cells too
     """
     without = (tidy[tidy.task == task].noise == NO_NOISE).unique()
     return (noise == NO_NOISE) in without
 
 
 def grid(tidy: pd.DataFrame) -> tuple[list[str], list[float], list[str]]:
-    """Tasks, noises and algorithms, in the order of the runs."""
+    """
+    :param tidy: aggregated evaluations
+    :return: tasks in the order of the runs, sorted noises, and algorithms in the order of the runs
+    """
     return list(tidy.task.unique()), sorted(tidy.noise.unique()), list(tidy.algorithm.unique())
 
 
 def palette(algorithms: list[str]) -> dict[str, str]:
     """
-    :param algorithms: any number
-    :return: a color for each, in the same order
+    :param algorithms: names of algorithms, any number
+    :return: algorithm -> its color, in the same order
     """
     if len(algorithms) <= len(COLORS):
         return dict(zip(algorithms, COLORS, strict=False))
@@ -96,15 +100,16 @@ def palette(algorithms: list[str]) -> dict[str, str]:
 
 def has_guider(group: pd.DataFrame) -> bool:
     """
-    :param group: one algorithm in one cell
+    :param group: evaluations of one algorithm in one cell
+    :return: whether the algorithm's guider was evaluated
     """
     return "guider" in group and bool(group.guider.notna().any())
 
 
 def guider_of(algorithm: str) -> str:
     """
-    :param algorithm: its name
-    :return: that of its guider's curve
+    :param algorithm: name of an algorithm
+    :return: name of the curve of the algorithm's guider
     """
     return f"{algorithm}, guider"
 
@@ -115,11 +120,11 @@ def _line(algorithm: str, x: Any, y: Any, name: str, **style: Any) -> graph_obje
 
 def algorithm_lines(group: pd.DataFrame, algorithm: str, color: str) -> list[graph_objects.Scatter]:
     """
-    :param group: one algorithm in one cell
-    :param algorithm: its name
-    :param color: its color
-    :return: each seed's curve, the interval around the mean as a band, the mean, and the guider's mean in dashes. Over a
-        step the mean tells its interval and each seed's return
+    :param group: evaluations of one algorithm in one cell
+    :param algorithm: name of the algorithm
+    :param color: color of the algorithm
+    :return: curve of each seed, interval of the mean as a band, mean, and the guider's mean in dashes. Where the pointer is,
+        the mean shows its interval and each seed's return
     """
     thin: dict[str, Any] = {"line": {"color": color, "width": 0.7}, "opacity": 0.5, "hoverinfo": "skip"}
     runs = group.groupby("seed")
@@ -137,7 +142,7 @@ def algorithm_lines(group: pd.DataFrame, algorithm: str, color: str) -> list[gra
 
 
 def _told(group: pd.DataFrame, learner: pd.DataFrame, color: str) -> dict[str, Any]:
-    """The mean's style, and what is told over it."""
+    """The style of the mean's curve, and the text that is shown where the pointer is."""
     at_steps = group.groupby("timesteps").learner
     several = [
         [f"{low:,.4g} to {high:,.4g}", ", ".join(f"{value:,.4g}" for value in at_steps.get_group(step))]
@@ -151,19 +156,19 @@ def in_cells(
     tidy: pd.DataFrame, lines_of: Lines, y_title: str, x_title: str, one_column: bool = False
 ) -> graph_objects.Figure:
     """
-    :param tidy: as aggregated
-    :param lines_of: one algorithm in one cell, its name, its color -> its curves
-    :param y_title: of all axes
-    :param x_title: likewise
-    :param one_column: whether cells are below each other; else tasks are across and noises down
-    :return: the cells, each with its curves; a click on a name switches an algorithm off in all of them
+    :param tidy: aggregated evaluations
+    :param lines_of: function of the evaluations of one algorithm in one cell, its name and its color that returns its curves
+    :param y_title: title of all vertical axes
+    :param x_title: title of all horizontal axes
+    :param one_column: whether cells are below each other; otherwise tasks are across and noises down
+    :return: figure with the curves of each cell; a click on a name switches an algorithm off in all cells
     """
     tasks, noises, algorithms = grid(tidy)
     cells = {(task, noise): is_wanted(tidy, task, noise) for noise in noises for task in tasks}
     titles = [title_of(*cell) if wanted else "" for cell, wanted in cells.items()]
     columns = 1 if one_column else len(tasks)
     rows = len(cells) // columns
-    gap = {"vertical_spacing": 0.3 / rows, "horizontal_spacing": 0.28 / columns}  # where names of axes go
+    gap = {"vertical_spacing": 0.3 / rows, "horizontal_spacing": 0.28 / columns}  # room for the titles of axes
     figure = make_subplots(rows=rows, cols=columns, subplot_titles=titles, **gap)
     figure.update_xaxes(title_text=x_title)
     figure.update_yaxes(title_text=y_title)
@@ -192,8 +197,8 @@ def _range(figure: graph_objects.Figure, place: int) -> tuple[float, float]:
 
 def returns_range(cell: pd.DataFrame) -> tuple[float, float]:
     """
-    :param cell: evaluations
-    :return: of an axis that holds all runs: what the intervals of few seeds reach beyond them would hide the rest
+    :param cell: evaluations of one cell
+    :return: lower and upper limit of an axis that shows all runs; intervals of few seeds are cut off where they reach further
     """
     return _around([cell[column] for column in ("learner", "guider") if column in cell])
 
@@ -206,7 +211,7 @@ def _around(values: Sequence[Any]) -> tuple[float, float]:
 
 
 def _say(figure: graph_objects.Figure, row: int, column: int, text: str) -> None:
-    """A word in place of curves. (No note can refer to the axes of a place where nothing is drawn.)"""
+    """Write a text in the place of a cell's curves. A note cannot refer to axes in which nothing is drawn."""
     place = figure.get_subplot(row, column)
     x, y = (sum(axis.domain) / 2 for axis in (place.xaxis, place.yaxis))
     figure.add_annotation(text=text, x=x, y=y, xref="paper", yref="paper", showarrow=False)
@@ -227,15 +232,15 @@ def _frame(rows: int) -> dict[str, Any]:
 
 def interactive(tidy: pd.DataFrame, one_column: bool = False) -> graph_objects.Figure:
     """
-    :param tidy: as aggregated
-    :param one_column: see :func:`in_cells`
-    :return: returns over steps
+    :param tidy: aggregated evaluations
+    :param one_column: whether cells are below each other, see :func:`in_cells`
+    :return: figure of the returns over environment steps
     """
     return in_cells(tidy, algorithm_lines, RETURN, steps_label(tidy), one_column)
 
 
 def _mean_line(column: str, group: pd.DataFrame, algorithm: str, color: str) -> list[graph_objects.Scatter]:
-    """The mean over seeds of what not all algorithms have."""
+    """The curve of a column's mean over seeds; none if the algorithm has no such column."""
     if column not in group or group[column].isna().all():
         return []
     mean = group.groupby("timesteps")[column].mean()
@@ -250,10 +255,10 @@ def _plot(name: str, tidy: pd.DataFrame, lines_of: Lines, y_title: str, x_title:
 
 def plots(tidy: pd.DataFrame, seconds: Mapping[str, float], normalised: pd.DataFrame) -> list[Plot]:
     """
-    :param tidy: as aggregated
-    :param seconds: run -> how long it took; of none, nothing is drawn over them
-    :param normalised: a row for each run: "task", "noise", "algorithm", "normalised"
-    :return: the tabs, those alone that there are data for
+    :param tidy: aggregated evaluations
+    :param seconds: run's name -> seconds that the run took; if it is empty, there is no plot over seconds
+    :param normalised: table with one row for each run: "algorithm", and the "normalised" final return
+    :return: plots for which there are data, one for each tab
     """
     steps = steps_label(tidy)
     drawn = [_plot("Returns", tidy, algorithm_lines, RETURN, steps, _RETURNS)]
@@ -292,10 +297,10 @@ _PROFILE = (
 
 def over_seconds(tidy: pd.DataFrame, seconds: Mapping[str, float]) -> pd.DataFrame:
     """
-    :param tidy: as aggregated
-    :param seconds: run -> how long it took
-    :return: the evaluations of timed runs, with the mean seconds of their algorithm in the cell at that step in place of
-        timesteps
+    :param tidy: aggregated evaluations
+    :param seconds: run's name -> seconds that the run took
+    :return: evaluations of the runs whose seconds are known; in place of environment steps, ``timesteps`` has the seconds up
+        to that step, as a mean over the algorithm's runs in the cell
     """
     keys = ["task", "noise", "algorithm", "seed"]
     found = {key: taken for key, _ in tidy.groupby(keys) if (taken := _of_run(key, seconds)) is not None}

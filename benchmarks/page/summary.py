@@ -1,16 +1,16 @@
-"""What a suite's results say, in sentences."""
+"""The summary of a suite's results, in sentences."""
 
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-SURE = 0.5  # of the probability of improvement: neither
+SURE = 0.5  # probability of improvement at which neither algorithm is better
 
 
 def what_was_compared(results: dict[str, Any]) -> str:
     """
-    :param results: as aggregated
-    :return: a sentence: algorithms, cells, steps and seeds
+    :param results: aggregated results
+    :return: sentence with the algorithms, tasks, noises, environment steps and seeds
     """
     cells = results["cells"]
     algorithms = list(dict.fromkeys(cell["algorithm"] for cell in cells))
@@ -26,8 +26,9 @@ def what_was_compared(results: dict[str, Any]) -> str:
 
 def in_short(results: dict[str, Any]) -> list[str]:
     """
-    :param results: as aggregated
-    :return: sentences: who ends highest, how sure that is, what the intervals are, and what is still to run
+    :param results: aggregated results
+    :return: sentences that say which algorithm ends highest, how sure the order is, how wide intervals of few seeds are, and
+        how many runs are missing
     """
     sentences = [*_highest(results), *_overall(results), *_about_seeds(results)]
     if missing := len(results.get("still_to_run", [])):
@@ -79,7 +80,7 @@ def _about_seeds(results: dict[str, Any]) -> list[str]:
 
 def listed(names: Sequence[str]) -> str:
     """
-    :param names: at least one
-    :return: as in "a, b and c"
+    :param names: at least one name
+    :return: text such as "a, b and c"
     """
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

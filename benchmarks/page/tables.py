@@ -1,4 +1,4 @@
-"""The page's tables: returns, comparisons, and in what the algorithms' arguments differ."""
+"""The page's tables: returns, comparisons over all cells, and the arguments in which algorithms differ."""
 
 import html
 import math
@@ -9,24 +9,24 @@ import numpy as np
 
 from benchmarks.intervals import mean_interval
 
-#: So many seeds have an interquartile mean that is their mean
+#: Largest number of seeds whose interquartile mean is their mean
 SAME_MEAN = 3
-_SHORT = 30  # letters that are not to be broken
+_SHORT = 30  # characters of a text that is not to be broken into lines
 
 
 class Field(NamedTuple):
     """
-    Of a table.
+    A field of a table.
 
-    :param text: that is shown
-    :param value: that is sorted by, if it is a number
+    :param text: text that is shown
+    :param value: number by which rows are sorted, ``None`` to sort by the text
     """
 
     text: str
     value: float | None = None
 
     def html(self) -> str:
-        """Of a table's row."""
+        """Return the HTML of the field."""
         if self.value is None:
             short = " class=short-text" if len(self.text) <= _SHORT else ""
             return f"<td{short}>{html.escape(self.text)}</td>"
@@ -35,18 +35,19 @@ class Field(NamedTuple):
 
 def number(value: float | None, digits: int = 0) -> Field:
     """
-    :param value: ``None`` for an empty field, which is sorted below all others
-    :param digits: after the point
+    :param value: number to show, ``None`` for an empty field, which is sorted below all others
+    :param digits: digits after the point
+    :return: field of the number
     """
     return Field("", -math.inf) if value is None else Field(f"{value:,.{digits}f}", value)
 
 
 def table(head: Sequence[str], rows: Sequence[tuple[Sequence[Field], bool]], sortable: bool = True) -> str:
     """
-    :param head: names of columns
-    :param rows: fields, and whether they are the best of their kind
-    :param sortable: whether a click on a name sorts by it
-    :return: HTML
+    :param head: names of the columns
+    :param rows: rows, each with its fields, and whether the row is the best of its cell, which is shown in bold
+    :param sortable: whether a click on a column's name sorts the rows by that column
+    :return: HTML of the table
     """
     mark = " data-sortable" if sortable else ""
     names = "".join(f"<th{mark}>{html.escape(name)}</th>" for name in head)
@@ -58,8 +59,8 @@ def table(head: Sequence[str], rows: Sequence[tuple[Sequence[Field], bool]], sor
 
 def returns_table(cells: Sequence[Mapping[str, Any]]) -> str:
     """
-    :param cells: as aggregated
-    :return: HTML: a row for each algorithm in each cell, the best of a cell in bold
+    :param cells: "cells" of the aggregated results: one mapping for each algorithm in each cell
+    :return: HTML of a table with one row for each algorithm in each cell, the best one of a cell in bold
     """
     head = [
         "task",
@@ -108,9 +109,9 @@ def _returns(cell: Mapping[str, Any]) -> Iterator[Field]:
 
 def overall_table(results: Mapping[str, Any]) -> str:
     """
-    :param results: as aggregated
-    :return: HTML: normalised returns over all cells, and how probably a run of the row's algorithm ends above one of the
-        column's
+    :param results: aggregated results
+    :return: HTML of a table with the normalised returns over all cells, and the probability that a run of the row's algorithm
+        ends above a run of the column's algorithm
     """
     names = sorted(results["normalised_iqm"], key=lambda name: -results["normalised_iqm"][name][0])
     head = ["algorithm", "normalised IQM", "95% interval", *(f"above {name}" for name in names)]
@@ -131,8 +132,9 @@ def _improvement(estimate: Sequence[float] | None) -> Field:
 
 def differences_table(arguments: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict[str, Any]]:
     """
-    :param arguments: kind of run, such as "gac, Hopper, noise 0.1" -> the algorithm's arguments
-    :return: HTML: the arguments in which algorithms differ, each algorithm's first cell; and those that all share
+    :param arguments: algorithm in a cell, such as "gac, Hopper, noise 0.1" -> the algorithm's arguments there
+    :return: HTML of a table of the arguments in which algorithms differ, each with those of its first cell; and the arguments
+        that all algorithms share
     """
     flat: dict[str, dict[str, Any]] = {}
     for kind, of_kind in arguments.items():

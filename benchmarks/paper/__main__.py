@@ -1,5 +1,5 @@
 """
-The paper's figures and tables by number::
+Draws the paper's figures and prints its tables, by number::
 
     python -m benchmarks.paper figure 1                  # drawn from committed results, and what differs from the paper
     python -m benchmarks.paper figure 1 --run            # its runs are made, or gone on with, first
@@ -19,9 +19,9 @@ from benchmarks.paper.tables import TABLES
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """
-    Command line.
+    Entry point of the command line.
 
-    :param arguments: by default the process's
+    :param arguments: command-line arguments, by default those of the process
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     kinds = parser.add_subparsers(dest="kind", required=True)
@@ -47,17 +47,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def suffix(scale: str) -> str:
     """
     :param scale: one of ``SCALES``
-    :return: what tells a picture's name from that at the first one
+    :return: end of the name of a picture at this scale, empty for the first scale
     """
     return "" if scale == SCALES[0] else f"-{scale}"
 
 
 def make(suites: Sequence[str], jobs: int | None) -> None:
     """
-    Launch suites, or go on with them, and aggregate them.
+    Make the missing runs of suites, and aggregate the suites.
 
-    :param suites: their names
-    :param jobs: runs side by side
+    :param suites: names of the suites
+    :param jobs: number of runs side by side, ``None`` for one on each CPU
     """
     for name in suites:
         suite = str(SUITES / f"{name}.yml")
@@ -70,11 +70,11 @@ def make(suites: Sequence[str], jobs: int | None) -> None:
 
 def show(figure: Figure, scale: str, out: Path) -> None:
     """
-    Draw a figure, and print what it shows, what differs from the paper, and what it would take to make it anew.
+    Draw a figure, and print its title, its differences from the paper's, and the runs and the command that it needs.
 
-    :param figure: of the paper
+    :param figure: figure of the paper
     :param scale: one of ``SCALES``
-    :param out: the picture
+    :param out: file of the picture
     """
     print(f"Figure {figure.number}: {figure.title}.")
     if scale == SCALES[0]:

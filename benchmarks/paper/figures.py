@@ -1,4 +1,4 @@
-"""A figure of the paper's, drawn from aggregated results."""
+"""The paper's figures, drawn from aggregated results."""
 
 import json
 import math
@@ -28,14 +28,14 @@ MARGIN = 3.0
 
 class Group(NamedTuple):
     """
-    What shares axes.
+    Results of several suites that are drawn on the same axes.
 
-    :param suites: whose results they are
-    :param algorithms: to draw, all if empty
-    :param tasks: likewise
-    :param noises: likewise
-    :param panels: of each cell, of ``LABELS``
-    :param ends: suites with more steps, of which the last return alone is drawn
+    :param suites: names of the suites
+    :param algorithms: names of the algorithms to draw, all if empty
+    :param tasks: titles of the tasks to draw, all if empty
+    :param noises: sensor noises to draw, all if empty
+    :param panels: panels of each cell, keys of ``LABELS``
+    :param ends: names of suites with more steps, of which the last return alone is drawn, as a line across
     """
 
     suites: Sequence[str]
@@ -47,8 +47,8 @@ class Group(NamedTuple):
 
     def wanted(self, tidy: pd.DataFrame) -> pd.DataFrame:
         """
-        :param tidy: aggregated results
-        :return: its rows that belong to this group
+        :param tidy: aggregated evaluations
+        :return: evaluations of the algorithms, tasks and noises of this group
         """
         for column, values in (("algorithm", self.algorithms), ("task", self.tasks), ("noise", self.noises)):
             tidy = tidy[tidy[column].isin(values)] if values else tidy
@@ -57,12 +57,12 @@ class Group(NamedTuple):
 
 class Figure(NamedTuple):
     """
-    One of the paper's.
+    A figure of the paper.
 
-    :param number: in the paper
-    :param title: what it shows
-    :param groups: scale -> what is drawn
-    :param differs: in what the figure at two cores' scale differs from the paper's
+    :param number: number of the figure in the paper
+    :param title: title of the figure
+    :param groups: scale -> groups that are drawn, one below the other
+    :param differs: sentences that say how the figure at two cores' scale differs from the paper's
     """
 
     number: int
@@ -73,13 +73,13 @@ class Figure(NamedTuple):
     def suites(self, scale: str) -> list[str]:
         """
         :param scale: one of ``SCALES``
-        :return: names of all suites whose runs it takes, each once
+        :return: names of all suites whose runs the figure needs, each once
         """
         return list(dict.fromkeys(name for group in self.groups[scale] for name in (*group.suites, *group.ends)))
 
 
 def read_figures() -> dict[int, Figure]:
-    """All of them, by number."""
+    """Read the figures of ``figures.yml``, by number."""
     content = yaml.safe_load((HERE / "paper/figures.yml").read_text())
     return {
         number: Figure(
@@ -92,7 +92,7 @@ def read_figures() -> dict[int, Figure]:
 def results_of(suites: Sequence[str]) -> pd.DataFrame:
     """
     :param suites: names of suites
-    :return: the aggregated evaluations of all that there are; steps of needed runs count
+    :return: aggregated evaluations of the suites that have results; steps of needed runs are part of ``timesteps``
     """
     paths = [RESULTS / f"{name}.csv" for name in suites]
     frames = [with_needed_steps(read_tidy(path)) for path in paths if path.exists()]
@@ -101,8 +101,8 @@ def results_of(suites: Sequence[str]) -> pd.DataFrame:
 
 def needs(name: str) -> str:
     """
-    :param name: of a suite
-    :return: in words, what it takes to make its runs anew
+    :param name: name of a suite
+    :return: text with the number of the suite's runs, their steps, how many have been made, and the minutes that a run took
     """
     specs = read_suite(SUITES / f"{name}.yml")
     steps = f"{len(specs)} runs of {specs[0].steps:,} steps"
@@ -118,10 +118,10 @@ def needs(name: str) -> str:
 
 def draw(figure: Figure, scale: str, path: Path) -> bool:
     """
-    :param figure: of the paper
+    :param figure: figure of the paper
     :param scale: one of ``SCALES``
-    :param path: of the picture
-    :return: whether there was anything to draw; if not, there is no picture
+    :param path: file of the picture
+    :return: whether there were results to draw; without results, no picture is written
     """
     found = [_Drawn(one, *(one.wanted(results_of(names)) for names in (one.suites, one.ends))) for one in figure.groups[scale]]
     drawn = [one for one in found if one.cells]
@@ -141,7 +141,13 @@ def draw(figure: Figure, scale: str, path: Path) -> bool:
 
 
 class _Drawn(NamedTuple):
-    """A group with its rows of results."""
+    """
+    A group with its evaluations.
+
+    :param group: the group
+    :param tidy: evaluations to draw as curves
+    :param ends: evaluations of which the last return alone is drawn
+    """
 
     group: Group
     tidy: pd.DataFrame
@@ -155,7 +161,7 @@ class _Drawn(NamedTuple):
 
     @property
     def across(self) -> int:
-        """Columns: a cell's panels are side by side."""
+        """The number of columns; the panels of a cell are side by side."""
         panels = len(self.group.panels)
         return min(len(self.cells), max(MOST_ACROSS // panels, 1)) * panels
 
@@ -191,7 +197,7 @@ def _draw_panel(axis: Axes, panel: str, cell: pd.DataFrame, ends: pd.DataFrame, 
     if panel in (KL, KL_COEF):
         axis.set_yscale("log")
         low, high = (value for value in axis.get_ylim())
-        axis.set_ylim(low / MARGIN, high * MARGIN)  # a steady line is to look steady
+        axis.set_ylim(low / MARGIN, high * MARGIN)  # a steady line must look steady
     if panel == KL and cell.target_kl.nunique() == 1:
         axis.axhline(cell.target_kl.max(), color="black", linestyle=":", label="target_kl")
     if panel in (RETURNS, POLICIES):
@@ -202,7 +208,7 @@ def _draw_panel(axis: Axes, panel: str, cell: pd.DataFrame, ends: pd.DataFrame, 
 
 
 def _draw_algorithm(axis: Axes, panel: str, group: pd.DataFrame, name: str, color: str) -> None:
-    """The mean over seeds; of returns each seed's curve as well, in thin lines."""
+    """Draw the mean over seeds, and for returns each seed's curve too, in thin lines."""
     column = panel if panel in (KL, KL_COEF) else "learner"
     mean = group.groupby("timesteps")[column].mean()
     axis.plot(mean.index, mean, color=color, label=name, linewidth=2)

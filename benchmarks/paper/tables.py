@@ -1,4 +1,4 @@
-"""The paper's tables, and what ours have in the same place."""
+"""The paper's tables, with this package's values beside the paper's."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -22,8 +22,9 @@ _CONTENT = yaml.safe_load((HERE / "paper/tables.yml").read_text())
 
 def settings(number: int) -> str:
     """
-    :param number: of a table of settings
-    :return: parameters, the paper's values, those of our preset of that table, and those of the preset ``small``
+    :param number: number of a table of settings
+    :return: text of the table: parameters, the paper's values, those of the preset with the paper's settings, and those of the
+        preset ``small``
     """
     table = _CONTENT["settings"][number]
     columns = [table["preset"], OURS]
@@ -38,7 +39,7 @@ def settings(number: int) -> str:
 
 
 def _arguments(name: str) -> dict[str, Any]:
-    """GAC's with its defaults, and how many environments and steps go with them."""
+    """The arguments of GAC in a preset, its defaults included, and the preset's numbers of environments and steps."""
     run, arguments = read_preset(name).run, preset(name)
     signatures = [inspect.signature(kind).parameters.values() for kind in reversed(GAC.__mro__[:-1])]
     defaults = {one.name: one.default for parameters in signatures for one in parameters if one.default is not one.empty}
@@ -48,7 +49,7 @@ def _arguments(name: str) -> dict[str, Any]:
 
 
 def _value_at(arguments: Any, path: str) -> Any:
-    """By keys with dots between; the same layers of all networks stand for those of one."""
+    """The value at a path of keys with dots between; a value on the way that is no mapping holds for all keys below it."""
     for key in path.split("."):
         if not isinstance(arguments, Mapping):
             return arguments
@@ -68,8 +69,8 @@ def _in_words(value: Any) -> str:
 
 def target_kls(number: int) -> str:
     """
-    :param number: of a table of ``target_kl`` by task and noise
-    :return: the paper's values, and those of our presets
+    :param number: number of a table of ``target_kl`` by task and noise
+    :return: text of the table: the paper's values, and those of the presets ``paper`` and ``small``
     """
     rows = []
     for task, values in _CONTENT["target_kl"][number].items():
@@ -82,8 +83,8 @@ def target_kls(number: int) -> str:
 
 def missing(number: int) -> str:
     """
-    :param number: of a table whose values the paper's text does not have
-    :return: a word about it
+    :param number: number of a table whose values are missing from the paper's text
+    :return: text that says so
     """
     return (
         f"Table {number}: target_kl by task in HumanoidBench. The text of the paper has its caption alone; Table 5 has the "
@@ -93,8 +94,8 @@ def missing(number: int) -> str:
 
 def observations(number: int) -> str:
     """
-    :param number: of a table of sizes
-    :return: the paper's sizes, and ours
+    :param number: number of a table of sizes of observations
+    :return: text of the table: the paper's sizes, and those of this package's tasks
     """
     rows = [[task, *map(str, sizes), *_own_sizes(task)] for task, sizes in _CONTENT["observations"][number].items()]
     head = ["task", *(f"paper: {part}" for part in ("whole", PARTIAL, PRIVILEGED)), f"ours: {PARTIAL}", PRIVILEGED, "hidden"]
@@ -103,7 +104,7 @@ def observations(number: int) -> str:
 
 
 def _own_sizes(task: str) -> Sequence[str]:
-    """Of the entries, and how much of the privileged one partial does not show."""
+    """The sizes of the entries ``partial`` and ``privileged``, and of the part of ``privileged`` that ``partial`` lacks."""
     env_id = env_id_of(task)
     shapes = SUITES[suite_of(env_id) or ""].environments[env_id]["shapes"]
     partial_size, privileged = shapes[PARTIAL][0], shapes[PRIVILEGED][0]
@@ -111,7 +112,7 @@ def _own_sizes(task: str) -> Sequence[str]:
     return [str(partial_size), str(privileged), str(hidden)]
 
 
-#: Number -> what makes the table
+#: Number of a table -> function that makes the table's text
 TABLES: dict[int, Callable[[], str]] = {
     **{number: partial(settings, number) for number in _CONTENT["settings"]},
     **{number: partial(target_kls, number) for number in _CONTENT["target_kl"]},

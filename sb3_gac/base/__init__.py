@@ -1,1 +1,1 @@
-"""What all algorithms with a privileged view share."""
+"""The parts that all algorithms with a privileged view share."""

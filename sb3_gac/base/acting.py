@@ -13,12 +13,12 @@ from sb3_gac.checks.entries import ObservationReader
 from sb3_gac.math.distributions import Distribution
 from sb3_gac.networks.actors import BoundedPolicy, DeployedPolicy
 
-#: What each policy's network remembers, shapes (B, S), ``None`` without a memory; ``None`` before the first step
+#: The memory of each policy's network, shape (B, S), or ``None`` for a network without one; ``None`` before the first step
 BehaviourState: TypeAlias = tuple[np.ndarray | None, ...] | None
 
 
 class ActingPolicy(BoundedPolicy):
-    """Policies by role, of which the deployed one is what this one is outside of training; a subclass builds them."""
+    """A policy made of an algorithm's policies by role, which acts as the deployed one; a subclass builds the networks."""
 
     roles: ClassVar[Roles]
     role_keys: dict[str, tuple[str, ...]]
@@ -32,10 +32,12 @@ class ActingPolicy(BoundedPolicy):
 
     def check_seen_by(self, role: str, observation: Any, where: str) -> None:
         """
-        :param role: that is about to act
-        :param observation: that it was handed
-        :param where: the method that was called, for the message
-        :raises ValueError: if an entry is missing that the role or, because it acts beside it, the deployed policy reads
+        Check that an observation has all entries that a policy needs to act.
+
+        :param role: role of the policy that is about to act
+        :param observation: observation that the policy was handed
+        :param where: name of the method that was called, for the message
+        :raises ValueError: if an entry is missing that the role's policy reads, or the deployed one, which runs beside it
         """
         reads = list(dict.fromkeys([*self.role_keys[role], *self.role_keys[self.roles.deployed]]))
         if not isinstance(observation, Mapping):
@@ -49,15 +51,17 @@ class ActingPolicy(BoundedPolicy):
 
     def acting_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:
         """
-        :param outputs: role -> what its network computed, for each policy
+        The distributions of all policies' actions. A subclass whose policies act relative to each other overrides this method.
+
+        :param outputs: role -> output of its network, for each policy
         :return: role -> distribution of its actions
         """
         return outputs
 
     def behaviour_distribution(self, obs: PyTorchObs) -> Distribution:
         r"""
-        :param obs: full observation, (\*E, ...) of each entry
-        :return: distribution of the actions of the policy that collects the data, shapes (\*E, A)
+        :param obs: full observation, each entry of shape (\*E, ...), where ``*E`` are any leading dimensions
+        :return: distribution of the actions of the policy that collects the data, its tensors of shape (\*E, A)
         """
         outputs = {role: getattr(self, role).distribution(obs) for role in self.roles.policies}
         return self.acting_distributions(outputs)[self.roles.behaviour]
@@ -72,15 +76,15 @@ class ActingPolicy(BoundedPolicy):
         acting: Sequence[str] | None = None,
     ) -> tuple[np.ndarray, BehaviourState]:
         r"""
-        Action of the policies that collect the data, in [-1, 1] or one of a number.
+        Actions of the policies that collect the data.
 
-        :param observation: full observation, B of each entry
-        :param state: what the last call returned, ``None`` at the start
-        :param episode_start: true where an episode starts, shape (B,)
-        :param deterministic: mode instead of a sample
-        :param acting: role that acts in each environment; by default ``roles.behaviour``
-        :return: shape (B, \*action shape), and what policies remember, those that do not act as well; but for the action that
-            is then taken, see :meth:`with_actions`
+        :param observation: full observation, each entry of shape (B, ...)
+        :param state: state that the last call returned; ``None`` at the start
+        :param episode_start: booleans, true where an episode starts, shape (B,)
+        :param deterministic: whether to take the distribution's mode instead of a sample
+        :param acting: role of the policy that acts in each of the B environments; ``None`` for ``roles.behaviour`` in all
+        :return: actions in [-1, 1] or numbers of discrete actions, shape (B, \*action shape), and the memories of all
+            policies, acting or not, to which :meth:`with_actions` has yet to add the action that is taken
         """
         obs, _ = self._acting_reader.read(observation, self.device)
         names = self.roles.policies
@@ -97,9 +101,11 @@ class ActingPolicy(BoundedPolicy):
 
     def with_actions(self, state: BehaviourState, actions: np.ndarray) -> BehaviourState:
         r"""
-        :param state: what :meth:`behaviour_action` returned
-        :param actions: that were then taken, in [-1, 1] or one of a number, shape (B, \*action shape)
-        :return: what each policy remembers of both, for the next call
+        Add the actions that were taken to the policies' memories.
+
+        :param state: state that :meth:`behaviour_action` returned
+        :param actions: actions that were then taken, in [-1, 1] or numbers of discrete actions, shape (B, \*action shape)
+        :return: state for the next call of :meth:`behaviour_action`
         """
         if state is None:
             return None
@@ -110,18 +116,20 @@ class ActingPolicy(BoundedPolicy):
     @th.no_grad()
     def frozen_action(self, policy: nn.Module, observation: dict[str, np.ndarray]) -> np.ndarray:
         r"""
-        :param policy: that is no network of this one's, see :class:`sb3_gac.base.frozen.FrozenPolicy`
-        :param observation: full observation, B of each entry
-        :return: a sample of its actions, in [-1, 1] or of a number, shape (B, \*action shape)
+        Actions of a policy that is none of the algorithm's networks.
+
+        :param policy: policy to ask, see :class:`sb3_gac.base.frozen.FrozenPolicy`
+        :param observation: full observation, each entry of shape (B, ...)
+        :return: sampled actions, in [-1, 1] or numbers of discrete actions, shape (B, \*action shape)
         """
         obs, _ = self.reader.read(observation, self.device)
         return self._chosen(policy(obs), deterministic=False)
 
     def _chosen(self, actions: Distribution, deterministic: bool) -> np.ndarray:
         r"""
-        :param actions: shapes (B, A)
-        :param deterministic: mode instead of a sample
-        :return: shape (B, \*action shape)
+        :param actions: distribution of actions, its tensors of shape (B, A)
+        :param deterministic: whether to take the distribution's mode instead of a sample
+        :return: chosen actions, shape (B, \*action shape)
         """
         chosen = actions.mode if deterministic else actions.sample()
         return chosen.cpu().numpy().reshape(-1, *self.action_space.shape)  # type: ignore[misc]
@@ -136,16 +144,16 @@ class ActingPolicy(BoundedPolicy):
         """
         The deployed policy's action; entries that it does not read are ignored.
 
-        :param observation: single or batched; ``{"partial": ...}``, a full dict, or the partial entry alone
-        :param state: what a recurrent policy's last call returned, ``None`` at the start
-        :param episode_start: true where an episode starts, shape (B,)
-        :param deterministic: mode instead of a sample
+        :param observation: one observation or a batch: a full dict, ``{"partial": ...}``, or the partial entry's array alone
+        :param state: state that the last call returned, for a recurrent policy; ``None`` at the start
+        :param episode_start: booleans, true where an episode starts, shape (B,)
+        :param deterministic: whether to take the distribution's mode instead of a sample
         :return: action in the environment's range, and the state for the next call
         """
         return self.deployed.predict(observation, state, episode_start, deterministic)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """The deployed policy's action, in [-1, 1] of shape (B, A), or one of a number of shape (B,)."""
+        """The deployed policy's actions: in [-1, 1], shape (B, A), or numbers of discrete actions, shape (B,)."""
         return self._predict(obs, deterministic)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
@@ -153,9 +161,12 @@ class ActingPolicy(BoundedPolicy):
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """
-        :param observation: dict of observation entries, single or batched; unknown entries are dropped
-        :return: tensors, and whether they were batched
-        :raises ValueError: naming the entry that does not fit its space, or is not as many as the others
+        Convert an observation to tensors on the policy's device.
+
+        :param observation: one observation or a batch: a dict, of which unknown entries are dropped, or the array of the one
+            entry that the deployed policy reads
+        :return: tensor of each entry, shape (B, ...), and whether the observation was a batch
+        :raises ValueError: naming the entry that does not fit its space, or whose batch size differs from the others'
         """
         if not isinstance(observation, Mapping):
             return self.deployed.obs_to_tensor(observation)

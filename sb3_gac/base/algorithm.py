@@ -42,18 +42,18 @@ class AsymmetricAlgorithm(
     ConstructorArguments, DeploymentGuard, ResumableAlgorithm, FaultTolerance, EpisodeHooks, GradientSteps, Compilation
 ):
     """
-    Base of all algorithms, beside SB3's ``OffPolicyAlgorithm`` or ``OnPolicyAlgorithm``: each ancestor adds one ability to
-    either, and reads nothing of the others but what it declares.
+    Base of all algorithms, beside SB3's ``OffPolicyAlgorithm`` or ``OnPolicyAlgorithm``.
 
-    ``argument_checks`` says what each argument may be, ``_check_arguments`` what depends on others.
+    Each ancestor adds one ability to either of the two, and reads no attributes of other ancestors than those it declares.
+    ``argument_checks`` says what each argument may be by itself, ``_check_arguments`` what combinations there may be.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {}
-    #: Argument -> what raises a ValueError unless it is allowed; a subclass writes its own, its ancestors' count as well
+    #: Argument -> function that raises a ValueError unless its value is allowed; entries of ancestors count as well
     argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = COMMON_CHECKS
-    #: Arguments that files hold results of: given to ``load`` or ``resume``, they count once those are restored
+    #: Arguments whose results are in files: ``load`` and ``resume`` apply them after those results have been restored
     restored_arguments: ClassVar[tuple[str, ...]] = ("lr_scales", "stats_window_size")
-    #: Arguments that are models, or their paths, and that training asks for their policies, see :attr:`frozen`
+    #: Arguments that are trained models or their paths, whose policies training asks for actions, see :attr:`frozen`
     frozen_arguments: ClassVar[tuple[str, ...]] = ()
     #: Name of such an argument -> its policy, from the first ``learn`` on
     frozen: dict[str, FrozenPolicy]
@@ -78,14 +78,14 @@ class AsymmetricAlgorithm(
     def _setup_model(self) -> None:
         make_arguments_plain(self)
         self._check_arguments()
-        self.algorithm = algorithm_of(type(self))  # so that a file says whose it is
+        self.algorithm = algorithm_of(type(self))  # so that a file says which algorithm wrote it
         self.algorithm_path = f"{type(self).__module__}:{type(self).__qualname__}"
         as_given = {"policy_kwargs": self.policy_kwargs, **self._prepare_data()}
         self.policy_kwargs = self._all_policy_kwargs()
         try:
             super()._setup_model()  # type: ignore[safe-super]
         finally:
-            self.__dict__.update(as_given)  # saved as the user gave them
+            self.__dict__.update(as_given)  # so that files hold them as the user gave them
         side_effects = has_side_effects(self.policy)
         self._branches_are_independent = self.device.type == "cpu" and bool(self.policy.side_branch) and not side_effects
         if self.compile not in (False, AUTO):
@@ -95,14 +95,14 @@ class AsymmetricAlgorithm(
         self.programs = {}
         self._behaviour_state: BehaviourState = None
         self.frozen = {}
-        if self.env is not None:  # to act takes no teacher
+        if self.env is not None:  # a model without environments only acts, which takes no teacher
             self._load_frozen(needed=False)
 
     def _prepare_data(self) -> dict[str, Any]:
         """
-        Before SB3's set-up: make what holds the data.
+        Make the replay buffer, in an algorithm that has one, before SB3's set-up.
 
-        :return: attributes that are others until that is done, as they were given
+        :return: attributes that the set-up needs changed: name -> value that was given, which is put back afterwards
         """
         return {}
 
@@ -116,6 +116,8 @@ class AsymmetricAlgorithm(
 
     def _check_arguments(self) -> None:
         """
+        Check the arguments, each by itself and together.
+
         :raises ValueError: naming the argument and the remedy
         """
         if not (isinstance(self.policy_class, type) and issubclass(self.policy_class, AsymmetricPolicy)):
@@ -136,15 +138,15 @@ class AsymmetricAlgorithm(
         return {**self._policy_options(), **present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")}
 
     def _policy_options(self) -> dict[str, Any]:
-        """Arguments of the policy class that are arguments of the algorithm."""
+        """The algorithm's own arguments that it hands to the policy class."""
         return {"role_keys": self.role_keys, "lr_scales": self.lr_scales}
 
     def make_coefficients(self) -> dict[str, Coefficient]:
-        """Name -> what a loss multiplies one of its terms with."""
+        """The algorithm's coefficients: name -> coefficient, whose value multiplies a term of a loss."""
         return {}
 
     def _keep_coefficients(self) -> None:
-        """Under the names that files know them by."""
+        """Keep each coefficient as the attribute whose name files use."""
         for name, coefficient in self.coefficients.items():
             setattr(self, f"{name}_dual", coefficient)
 
@@ -152,27 +154,27 @@ class AsymmetricAlgorithm(
 
     @property
     def actor(self) -> th.nn.Module:
-        """The deployed policy; called, it returns actions."""
+        """The deployed policy's network, which returns actions when it is called."""
         return self.policy.actor  # type: ignore[return-value]
 
     @property
     def critic(self) -> th.nn.Module:
-        """The critics that the deployed policy climbs."""
+        """The critics whose value the deployed policy is trained to increase."""
         return self.policy.critic  # type: ignore[return-value]
 
     @property
     def critic_target(self) -> th.nn.Module:
-        """Target of :attr:`critic`."""
+        """The target network of :attr:`critic`."""
         return self.policy.critic_target  # type: ignore[return-value]
 
     @property
     def wrapper_outside_normalisation(self) -> Any:
-        """What changes observations after ``VecNormalize`` has normalised them; ``None`` if nothing does."""
+        """The wrapper that changes observations after ``VecNormalize`` has normalised them; ``None`` if there is none."""
         return None if self.env is None else ReplaySource(self.env).in_the_way
 
     @property
     def log_ent_coef(self) -> th.Tensor | None:
-        """Logarithm of a learned entropy temperature; ``None`` if it is fixed, or there is none."""
+        """Logarithm of a learned entropy temperature; ``None`` if the temperature is fixed or absent."""
         temperature = self.coefficients.get("ent_coef")
         return temperature.log_value if isinstance(temperature, DualVariable) else None
 
@@ -183,7 +185,7 @@ class AsymmetricAlgorithm(
 
     @property
     def ent_coef_optimizer(self) -> th.optim.Optimizer | None:
-        """Optimiser of a learned entropy temperature; ``None`` if it is fixed, or there is none."""
+        """Optimiser of a learned entropy temperature; ``None`` if the temperature is fixed or absent."""
         temperature = self.coefficients.get("ent_coef")
         return None if temperature is None else temperature.optimizer
 
@@ -203,8 +205,10 @@ class AsymmetricAlgorithm(
 
     def _load_frozen(self, needed: bool) -> None:
         """
-        :param needed: whether training is about to begin
-        :raises ValueError: if one is not there that is needed, or was trained on other spaces
+        Load the frozen teachers that are not loaded yet.
+
+        :param needed: whether training is about to begin, for which every teacher must be there
+        :raises ValueError: if a needed teacher is missing, or a teacher was trained on other spaces
         """
         assert isinstance(self.observation_space, spaces.Dict)
         for name in set(self.frozen_arguments) - set(self.frozen):
@@ -225,7 +229,7 @@ class AsymmetricAlgorithm(
     # --- save and load ----------------------------------------------------------------------------------------------
 
     def get_parameters(self) -> dict[str, dict]:
-        """See SB3's ``get_parameters``: optimisers' options are Python's numbers, whatever a schedule or a callback left."""
+        """See SB3's ``get_parameters``; options of optimisers become Python's numbers, whatever set them."""
         self.policy.refresh_parameters()
         parameters = super().get_parameters()
         for name, state in parameters.items():
@@ -236,7 +240,7 @@ class AsymmetricAlgorithm(
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        """See SB3's ``set_parameters``; optimisers' state of earlier versions becomes that of present ones."""
+        """See SB3's ``set_parameters``; states of optimisers from earlier versions are converted to the present layout."""
         parameters = load_path_or_dict
         if not isinstance(parameters, dict):
             _, parameters, _ = load_from_zip_file(parameters, device=device, load_data=False)
@@ -249,8 +253,11 @@ class AsymmetricAlgorithm(
 
     def _change_arguments(self, given: dict[str, Any]) -> None:
         """
-        :param given: some of ``restored_arguments``; they take the place of what was restored. A coefficient that is learned
-            before and after goes on from where it was, unless it is given a start value
+        Put arguments in the place of restored ones.
+
+        A coefficient that is learned before and after goes on from its restored value, unless it is given a start value.
+
+        :param given: name -> value of some of ``restored_arguments``
         """
         if not given:
             return

@@ -1,4 +1,4 @@
-"""Constructor arguments, each written once: those that all off-policy algorithms share, and how a class adds its own."""
+"""Constructor arguments, each written once: tables of shared ones, and signatures that add a class's own."""
 
 import inspect
 import warnings
@@ -22,7 +22,7 @@ from sb3_gac.checks.arguments import merged
 
 
 class CommonArguments(TypedDict, total=False):
-    """What on- and off-policy algorithms share, keyword-only: each a type and a default."""
+    """Type and default of the keyword-only arguments that on- and off-policy algorithms share."""
 
     lr_scales: Annotated[Mapping[str, float] | None, None]
     role_keys: Annotated[RoleKeys | None, None]
@@ -38,7 +38,7 @@ class CommonArguments(TypedDict, total=False):
 
 
 class PositionalArguments(TypedDict, total=False):
-    """What SB3's SAC takes after ``policy`` and ``env``, in its order: each a type and a default."""
+    """Type and default of the arguments of SB3's SAC after ``policy`` and ``env``, in SB3's order."""
 
     learning_rate: Annotated[float | Schedule, 3e-4]
     buffer_size: Annotated[int, 1_000_000]
@@ -70,9 +70,9 @@ class _OffPolicyArguments(PositionalArguments, total=False):
 
 class OffPolicyArguments(_OffPolicyArguments, CommonArguments, total=False):
     """
-    All that off-policy algorithms share but ``policy`` and ``env``, described by ``AsymmetricOffPolicyAlgorithm``.
+    All arguments that off-policy algorithms share, see ``AsymmetricOffPolicyAlgorithm``, except ``policy`` and ``env``.
 
-    A subclass with arguments of its own names these alone, keyword-only, and hands on what it does not know::
+    A subclass with arguments of its own names only these, keyword-only, and hands on all others::
 
         def __init__(self, policy, env, *sb3, teacher, coef_step=0.01, **shared: Unpack[OffPolicyArguments]):
             self.teacher, self.coef_step = teacher, coef_step
@@ -81,7 +81,7 @@ class OffPolicyArguments(_OffPolicyArguments, CommonArguments, total=False):
 
 
 class PositionalOnPolicyArguments(TypedDict, total=False):
-    """What SB3's PPO takes after ``policy`` and ``env``, in its order, as far as others have it: each a type and a default."""
+    """Type and default of the arguments of SB3's PPO after ``policy`` and ``env`` that all on-policy algorithms have."""
 
     learning_rate: Annotated[float | Schedule, 3e-4]
     n_steps: Annotated[int, 2048]
@@ -102,7 +102,7 @@ class _OnPolicyArguments(PositionalOnPolicyArguments, total=False):
 
 
 class OnPolicyArguments(_OnPolicyArguments, CommonArguments, total=False):
-    """All that on-policy algorithms share but ``policy`` and ``env``, described by ``AsymmetricOnPolicyAlgorithm``."""
+    """All arguments that on-policy algorithms share, see ``AsymmetricOnPolicyAlgorithm``, except ``policy`` and ``env``."""
 
 
 def _signature(shared: type, positional: type) -> inspect.Signature:
@@ -124,11 +124,13 @@ SHARED: dict[type, inspect.Signature] = {
 
 def with_defaults(shared: type, by_position: Sequence[Any], by_name: Mapping[str, Any]) -> dict[str, Any]:
     """
+    Complete arguments by their defaults.
+
     :param shared: table of arguments, a key of ``SHARED``
-    :param by_position: values of the first ones
-    :param by_name: others
-    :return: name -> value of each
-    :raises TypeError: Python's own, if there are too many or one is given twice
+    :param by_position: values of the first arguments of the table, in its order
+    :param by_name: name -> value of others
+    :return: name -> value, for every argument of the table
+    :raises TypeError: if there are too many arguments, or one is given twice
     """
     bound = SHARED[shared].bind(*by_position, **by_name)
     bound.apply_defaults()
@@ -137,18 +139,19 @@ def with_defaults(shared: type, by_position: Sequence[Any], by_name: Mapping[str
 
 class ConstructorArguments:
     """
-    The signature of a class's constructor has what it hands on, too, and former names of arguments stand for present ones.
+    Base of classes whose constructors take some arguments and hand on the others.
 
-    Each argument is kept as the attribute of its name, so that files hold it.
+    A constructor's signature shows the arguments that it hands on as well. Former names of arguments work like the present
+    ones, with a warning. Each argument is kept as the attribute of its name, so that files hold it.
     """
 
-    #: Former name -> present name, for one release; a subclass writes its own, and its ancestors' count as well
+    #: Former name -> present name of arguments, for one release; entries of ancestors count as well
     renamed_arguments: ClassVar[Mapping[str, str]] = {}
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         has_constructor = any("__init__" in vars(kind) for kind in cls.__mro__ if _is_ours(kind))
-        if has_constructor and not hasattr(cls.__init__, "__signature__"):  # its own, or that of a mixin
+        if has_constructor and not hasattr(cls.__init__, "__signature__"):  # the class's own constructor, or a mixin's
             type.__setattr__(cls, "__init__", _prepared(cls.__init__, inspect.Signature(_constructor_parameters(cls.__mro__))))
         for former, present in merged(cls, "renamed_arguments").items():
             setattr(cls, former, _former_attribute(former, present))
@@ -160,8 +163,8 @@ def _is_ours(kind: type) -> bool:
 
 def _constructor_parameters(mro: Sequence[type]) -> list[Parameter]:
     """
-    :param mro: a class and its ancestors, in the order of resolution
-    :return: what the first constructor takes itself, and what it hands on to the next one
+    :param mro: a class and its ancestors, in the order of method resolution
+    :return: parameters that the first constructor names, and those that it hands on to the next one
     """
     kind, *others = [kind for kind in mro if "__init__" in vars(kind)]
     own = list(inspect.signature(inspect.unwrap(vars(kind)["__init__"])).parameters.values())
@@ -179,7 +182,7 @@ def _constructor_parameters(mro: Sequence[type]) -> list[Parameter]:
     for each in handed_on:
         if each.name in named_before:
             continue
-        # What the class names itself can't come by position, nor can what follows it
+        # An argument that the class names itself can't come by position, nor can those that follow it
         by_position &= each.name not in named_behind and each.kind <= Parameter.POSITIONAL_OR_KEYWORD
         by_position &= each.default is not Parameter.empty or all(one.default is Parameter.empty for one in positional)
         if by_position:
@@ -192,15 +195,15 @@ def _constructor_parameters(mro: Sequence[type]) -> list[Parameter]:
 def _prepared(init: Callable[..., None], signature: inspect.Signature) -> Callable[..., None]:
     """
     :param init: a class's constructor
-    :param signature: with what it hands on
-    :return: the same, which says so, and which gets arguments by their present names
+    :param signature: signature of the constructor, arguments that it hands on included
+    :return: the constructor with that signature, called with the present names of arguments
     """
     named = [each for each in signature.parameters.values() if each.kind is not Parameter.VAR_KEYWORD]
     needed = [each.name for each in named if each.default is Parameter.empty]
 
     @wraps(init)
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
-        if type(self).__init__ is __init__:  # and not a subclass's, which calls this one
+        if type(self).__init__ is __init__:  # not where a subclass's constructor calls this one
             kwargs = present_names(type(self), kwargs, f"{type(self).__name__}()")
             saved = _SAVED.get().get(type(self), {})
             kwargs = {name: saved[name] for name in needed if name in saved} | kwargs
@@ -228,10 +231,13 @@ def _former_attribute(former: str, present: str) -> property:
 
 def present_names(kind: type, given: Mapping[str, Any], where: str | None) -> dict[str, Any]:
     """
-    :param kind: a class
-    :param given: name -> argument
-    :param where: they were given, for the warning about former names; ``None`` for a file, which nobody can be blamed for
-    :return: the same by their present names
+    Replace former names of arguments by present ones.
+
+    :param kind: class whose constructor takes the arguments
+    :param given: former or present name -> argument
+    :param where: call that the arguments were given to, for the warning about former names; ``None`` for those in a file,
+        which cause no warning
+    :return: present name -> argument
     :raises TypeError: if an argument is given by both names
     """
     renamed = merged(kind, "renamed_arguments")
@@ -251,10 +257,12 @@ _SAVED: ContextVar[Mapping[type, Mapping[str, Any]]] = ContextVar("saved", defau
 @contextmanager
 def needed_arguments_from(saved: Mapping[str, Any], kind: type) -> Iterator[None]:
     """
+    Give a constructor its arguments without a default from a file.
+
     SB3's ``load`` calls the constructor with ``policy``, ``env`` and ``device`` alone, and restores attributes afterwards.
 
-    :param saved: attributes; of the arguments that have no default, those that are among them are given to the constructor
-    :param kind: class that is loaded
+    :param saved: name -> attribute in the file
+    :param kind: class of the model that is loaded
     """
     token = _SAVED.set({kind: saved})
     try:

@@ -1,4 +1,4 @@
-"""Images that are shifted at random before a gradient step sees them."""
+"""Random shifts of images, as augmentation of the batches that gradient steps take."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -13,11 +13,13 @@ from sb3_gac.replay.samples import SequenceSamples
 
 def shifted_entries(space: spaces.Dict, keys: Iterable[str], pixels: int) -> tuple[str, ...]:
     """
-    :param space: of the observations
-    :param keys: entries that the deployed policy reads
-    :param pixels: argument ``random_shift``
-    :return: the images among them, if they are to be shifted
-    :raises ValueError: if they are to be, and there are none, or they are smaller than the shift
+    Entries of the observation that are to be shifted.
+
+    :param space: observation space of the environment
+    :param keys: names of the entries that the deployed policy reads
+    :param pixels: value of the argument ``random_shift``, in pixels
+    :return: names of the images among ``keys``; none if ``pixels`` is 0
+    :raises ValueError: if ``pixels`` is above 0, and there is no image or an image is smaller than the shift
     """
     if not pixels:
         return ()
@@ -35,10 +37,13 @@ def shifted_entries(space: spaces.Dict, keys: Iterable[str], pixels: int) -> tup
 
 def shifted(samples: Any, keys: Iterable[str], pixels: int) -> Any:
     """
-    :param samples: of a replay buffer
-    :param keys: entries that are images, (\\*E, H, W) each
-    :param pixels: see :func:`sb3_gac.math.images.random_shift`
-    :return: the same with observations and next ones shifted, each by numbers of its own; a sequence by the same throughout
+    Shift the images of a batch at random.
+
+    :param samples: batch that a replay buffer has sampled
+    :param keys: names of entries that are images, each of shape (\\*E, H, W)
+    :param pixels: largest shift in each direction, in pixels, see :func:`sb3_gac.math.images.random_shift`
+    :return: the batch with shifted observations and next observations; each image has its own shift, and all images of a
+        sequence have the same one
     """
     for key in keys:
         if isinstance(samples, SequenceSamples):

@@ -1,4 +1,4 @@
-"""What a gradient step works on and with: batches of data, what policies make of them, losses."""
+"""Types of a gradient step's data: batches of transitions, outputs of policies for them, and losses."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,18 +18,21 @@ Metrics = dict[str, th.Tensor]
 
 class Batch(NamedTuple):
     r"""
-    A batch of transitions, ``*E`` = (B,), or of sequences of them from episodes' starts on, ``*E`` = (T, B).
+    A batch of B transitions, ``*E`` = (B,), or of B sequences of T transitions from episodes' starts on, ``*E`` = (T, B).
 
-    :param observations: dict of entries, (\*E, ...) of each
-    :param actions: in [-1, 1], shape (\*E, A), or numbers of actions, shape (\*E, 1)
-    :param rewards: shape (\*E)
-    :param next_observations: dict of entries, (\*E, ...) of each
-    :param dones: 1 where the episode terminated, 0 where it went on or ran into its time limit, shape (\*E)
-    :param discounts: gamma to the number of steps that the reward sums up, scalar or shape (\*E)
-    :param sequence: of sequences, observations and the last next one together, (T + 1, B, ...) of each entry
-    :param mask: of sequences, 1 for what counts, 0 for padding and for what only brings memories up, shape (T, B)
-    :param histories: of transitions, what came before each, if the algorithm's ``history_length`` asks for it
-    :param critic_weights: 1 for what critics learn from, 0 for what they leave, shape (\*E); ``None`` if they learn from all
+    :param observations: dict of entries, each of shape (\*E, ...)
+    :param actions: actions in [-1, 1], shape (\*E, A), or numbers of discrete actions, shape (\*E, 1)
+    :param rewards: rewards, shape (\*E)
+    :param next_observations: dict of entries, each of shape (\*E, ...)
+    :param dones: 1 where the episode terminated, 0 where it went on or was truncated by its time limit, shape (\*E)
+    :param discounts: gamma to the power of the number of steps that the reward sums up, scalar or shape (\*E)
+    :param sequence: observations of sequences together with the last next observation, each entry of shape (T + 1, B, ...);
+        ``None`` for transitions
+    :param mask: mask of sequences, 1 for steps that losses count, 0 for padding and for steps that only bring memories up to
+        date, shape (T, B); ``None`` for transitions
+    :param histories: the steps before each transition, if the algorithm's ``history_length`` is above 0, else ``None``
+    :param critic_weights: 1 for transitions that critics learn from, 0 for the others, shape (\*E); ``None`` if critics learn
+        from all
     """
 
     observations: PyTorchObs
@@ -46,9 +49,11 @@ class Batch(NamedTuple):
     @classmethod
     def of(cls, samples: Any, gamma: float, histories: Histories | None = None) -> "Batch":
         """
-        :param samples: of a replay buffer
-        :param gamma: discount factor, where they have none of their own
-        :param histories: see :class:`Batch`
+        Make a batch of a replay buffer's samples.
+
+        :param samples: transitions or sequences that a replay buffer has sampled
+        :param gamma: discount factor, for samples without discounts of their own
+        :param histories: the steps before each transition, or ``None``
         """
         discounts = getattr(samples, "discounts", None)
         if discounts is None:
@@ -73,8 +78,10 @@ class Batch(NamedTuple):
 
     def outputs(self, policy: RolePolicy) -> "Outputs":
         """
-        :param policy: a policy's network
-        :return: its distributions for the observations and, as constants, for the next ones; with a memory in one pass
+        Run a policy's network on the batch; a network with a memory takes one pass over each sequence.
+
+        :param policy: network of a policy
+        :return: distributions of its actions for the observations and, as constants, for the next observations
         """
         if policy.memory is None:
             now = policy.distribution(self.observations)
@@ -87,10 +94,11 @@ class Batch(NamedTuple):
         r"""
         The Bellman target of these transitions.
 
-        :param next_q: target critics at the next observations, shape (N, \*E)
-        :param reward: in place of the batch's, shape (\*E)
-        :param terms: of :func:`sb3_gac.math.losses.soft_target`: entropy and KL at the next observations, and their weights
-        :return: shape (\*E)
+        :param next_q: values of the N target critics at the next observations, shape (N, \*E)
+        :param reward: rewards in place of the batch's, shape (\*E); ``None`` for the batch's
+        :param terms: further arguments of :func:`sb3_gac.math.losses.soft_target`: log-probability and KL at the next
+            observations, each of shape (\*E), and their weights
+        :return: target, shape (\*E)
         """
         reward = self.rewards if reward is None else reward
         return soft_target(reward=reward, done=self.dones, next_q=next_q, discount=self.discounts, **terms)
@@ -98,16 +106,20 @@ class Batch(NamedTuple):
     @th.no_grad()
     def q_at_obs(self, critic: Any) -> Callable[[Any], th.Tensor]:
         """
-        :param critic: an ensemble, frozen
-        :return: actions at the observations -> values, differentiable by the actions
+        The critics as a function of actions at the batch's observations.
+
+        :param critic: ensemble of critics, whose encoder and memory run here once, without gradients
+        :return: function: actions -> values of the critics, differentiable with respect to the actions
         """
         return partial(critic.values, critic.encode(self.observations))
 
     @th.no_grad()
     def q_at_next_obs(self, critic: Any) -> Callable[[Any], th.Tensor]:
         """
-        :param critic: an ensemble, frozen
-        :return: actions at the next observations -> values
+        The critics as a function of actions at the batch's next observations.
+
+        :param critic: ensemble of critics, whose encoder and memory run here once, without gradients
+        :return: function: actions -> values of the critics
         """
         if critic.memory is None:
             return partial(critic.values, critic.encode(self.next_observations))
@@ -116,10 +128,10 @@ class Batch(NamedTuple):
 
 class Outputs(NamedTuple):
     """
-    What a policy's network computes for a batch.
+    Outputs of a policy's network for a batch.
 
-    :param now: for the observations, with its gradient
-    :param later: for the next observations, constant
+    :param now: output for the observations, with its gradient
+    :param later: output for the next observations, a constant
     """
 
     now: Any
@@ -128,8 +140,10 @@ class Outputs(NamedTuple):
 
 class Loss(NamedTuple):
     """
-    :param value: what a network minimises, scalar
-    :param metrics: what else is to be logged, or is needed for the coefficients, scalars
+    A loss, with what is measured along with it.
+
+    :param value: quantity that a network minimises, scalar
+    :param metrics: name -> scalar, quantities to log or to update coefficients with
     """
 
     value: th.Tensor

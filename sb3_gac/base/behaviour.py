@@ -1,4 +1,4 @@
-"""Which policy collects the data: one, or a share of episodes or of environments for each."""
+"""The choice of the policy that collects the data: one, or several by shares of episodes or of environments."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
@@ -10,7 +10,7 @@ from sb3_gac.base.roles import Roles
 from sb3_gac.checks.values import check_choice
 from sb3_gac.schedules import as_schedule
 
-#: A policy's name, or name -> share of episodes, a number or a schedule, which may be text; the default policy has the rest
+#: A policy's name; or name -> share, a number or a schedule (which may be text), where the default policy has the remainder
 BehaviourSpec: TypeAlias = str | Mapping[str, float | str | Schedule] | None
 
 
@@ -18,9 +18,11 @@ class Behaviour:
     """
     Chooses which policy acts in each environment.
 
-    :param roles: of the algorithm
-    :param behaviour: see ``BehaviourSpec``; ``None`` for the policy that the algorithm collects with
-    :param per: "episode": drawn anew at each episode's start; "environment": the share is one of environments
+    :param roles: roles of the algorithm
+    :param behaviour: name of a policy, or name -> share, see ``BehaviourSpec``; ``None`` for the policy that the algorithm
+        collects data with
+    :param per: unit of the shares: "episode", where a policy is drawn at each episode's start, or "environment", where each
+        policy has a fixed part of the environments
     :param frozen: names of frozen policies, which may act as well
     :raises ValueError: if a name is no policy's, or shares are not from 0 to 1
     """
@@ -36,8 +38,10 @@ class Behaviour:
 
     def acts(self, role: str) -> bool:
         """
-        :param role: a policy
-        :return: whether it has a share at some time of training, of which nine are looked at
+        Whether a policy ever acts; shares are looked at in nine moments of training, at equal distances.
+
+        :param role: role of the policy
+        :return: whether its share is above 0 in one of these moments
         """
         return any(self._share_of(role, eighths / 8) > 0 for eighths in range(9))
 
@@ -47,9 +51,11 @@ class Behaviour:
 
     def shares_at(self, progress_remaining: float) -> dict[str, float]:
         """
-        :param progress_remaining: from 1 to 0
-        :return: share of each policy that has one by name
-        :raises ValueError: if these are no shares
+        Shares at a moment of training.
+
+        :param progress_remaining: fraction of training that remains, from 1 to 0
+        :return: role -> share, for each policy that was given one
+        :raises ValueError: if a share is not from 0 to 1, or their sum is above 1
         """
         now = {role: float(share(progress_remaining) if callable(share) else share) for role, share in self.shares.items()}
         if not (all(0 <= share <= 1 for share in now.values()) and sum(now.values()) <= 1 + 1e-9):
@@ -58,10 +64,12 @@ class Behaviour:
 
     def choose(self, acting: Sequence[str], episode_start: np.ndarray, progress_remaining: float) -> list[str]:
         """
-        :param acting: role that acted last in each environment
-        :param episode_start: true where an episode starts, shape (n_envs,)
-        :param progress_remaining: from 1 to 0
-        :return: role that acts now in each environment; it changes at an episode's start alone
+        Choose the policy that acts in each environment; where no episode starts, the policy stays.
+
+        :param acting: role of the policy that acted last in each environment
+        :param episode_start: booleans, true where an episode starts, shape (n_envs,)
+        :param progress_remaining: fraction of training that remains, from 1 to 0
+        :return: role of the policy that acts now in each environment
         """
         if not self.shares or not episode_start.any():
             return list(acting) if self.shares else [self.default] * len(episode_start)

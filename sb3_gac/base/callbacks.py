@@ -1,4 +1,4 @@
-"""Evaluation from the same seeds every time: of the deployed policy, and of guider and learner side by side."""
+"""Callbacks that evaluate from the same seeds every time: the deployed policy, or guider and learner side by side."""
 
 import warnings
 from collections.abc import Iterator
@@ -18,7 +18,11 @@ _WATCHED = ("train/kl", "train/target_kl", "train/kl_coef", "train/kl_coef_on_bo
 
 @contextmanager
 def _random_numbers_from(seed: int) -> Iterator[None]:
-    """torch's random numbers begin with a seed, and afterwards go on as if none had been drawn."""
+    """
+    Draw torch's random numbers from a seed; afterwards they go on as if none had been drawn.
+
+    :param seed: seed within the context
+    """
     with th.random.fork_rng():
         th.manual_seed(seed)
         yield
@@ -28,11 +32,11 @@ class SeededEvalCallback(EvalCallback):
     """
     ``EvalCallback`` with the same initial states and sensor noise at every evaluation, and its results kept in ``history``.
 
-    With ``deterministic=False`` the actions are sampled, by random numbers that are the same at every evaluation as well, and
-    that training does not see.
+    With ``deterministic=False`` actions are sampled, by random numbers that are the same at every evaluation as well. The
+    random numbers of training stay what they were.
 
     :param eval_env: environment for evaluation
-    :param eval_seed: seed of the evaluation environments before every evaluation
+    :param eval_seed: seed that the evaluation environments get before every evaluation
     :param kwargs: further arguments of SB3's ``EvalCallback``, such as ``eval_freq`` and ``n_eval_episodes``
     """
 
@@ -64,18 +68,18 @@ class SeededEvalCallback(EvalCallback):
         self._episode_returns = locals_["episode_rewards"]
 
     def _before_evaluation(self) -> None:
-        """For what else is to be evaluated."""
+        """Called before each evaluation; a subclass evaluates other policies here."""
 
     def _after_evaluation(self, returns: np.ndarray) -> None:
         """
-        For what is to be added to the last row of ``history``.
+        Called after each evaluation; a subclass may add to the last row of ``history``.
 
-        :param returns: of the deployed policy's episodes
+        :param returns: return of each of the deployed policy's episodes, shape (n_eval_episodes,)
         """
 
 
 class _GuiderPredictor:
-    """A model's guider, as something that SB3's ``evaluate_policy`` can evaluate."""
+    """A model's guider, in the form that SB3's ``evaluate_policy`` takes."""
 
     def __init__(self, model: Any):
         self.predict = model.predict_guider
@@ -83,20 +87,20 @@ class _GuiderPredictor:
 
 class GuiderLearnerEvalCallback(SeededEvalCallback):
     """
-    Evaluate the learner, as ``EvalCallback`` does, and the guider on the same seeds (the paper's Figure 4).
+    Evaluate the learner, as ``EvalCallback`` does, and the guider from the same seeds (the paper's Figure 4).
 
-    Logs ``eval/mean_reward`` (learner) and ``eval/guider_mean_reward``, and keeps both in ``history`` and in
+    The callback logs ``eval/mean_reward`` (learner) and ``eval/guider_mean_reward``. It keeps both in ``history`` and in
     ``guider_evaluations.npz`` under ``log_path``, with the means since the last evaluation of KL, its coefficient and
     ``learner_mean_abs`` (the size of the learner's mean action before tanh, where actions are continuous).
 
-    Warns when the learner no longer follows the guider, that is, when ``patience`` evaluations in a row find KL more than
+    It warns when the learner no longer follows the guider, that is, when ``patience`` evaluations in a row find KL more than
     twice its target, the KL coefficient on a bound, or a guider that is clearly better.
 
     :param eval_env: environment for evaluation
-    :param eval_seed: both policies are evaluated from these seeds, at every evaluation the same
-    :param patience: evaluations in a row before a warning
-    :param gap_tolerance: how much of the guider's mean return the learner may lack, beyond two standard errors
-    :param log_path: directory for results, ``None`` for none
+    :param eval_seed: seed that the evaluation environments get before each policy's evaluation
+    :param patience: number of evaluations in a row that lead to a warning
+    :param gap_tolerance: fraction of the guider's mean return that the learner may lack, beyond two standard errors
+    :param log_path: directory for results; ``None`` for no files
     :param kwargs: further arguments of SB3's ``EvalCallback``, such as ``eval_freq`` and ``n_eval_episodes``
     :raises TypeError: at the start of training, if the model has no guider
     """
@@ -128,7 +132,7 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
         super()._init_callback()
 
     def _on_rollout_start(self) -> None:
-        """Collect what the last gradient steps logged: the logger forgets it at every dump."""
+        """Collect the metrics that the last gradient steps logged, because the logger forgets them at every dump."""
         logged = self.logger.name_to_value
         for name in _WATCHED:
             if name in logged:

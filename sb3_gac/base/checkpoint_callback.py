@@ -20,20 +20,22 @@ _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 class ExactCheckpointCallback(BaseCallback):
     """
-    Calls :meth:`ResumableAlgorithm.save_checkpoint` where training can be taken up to the bit: before a rollout starts.
+    Save checkpoints before rollouts start, the moment from which a resumed run is the same to the bit.
 
-    On SIGTERM, as pre-empting schedulers send it, and on Ctrl-C the step is finished, a checkpoint made, and the process
-    ends with a message how to go on: ``SystemExit`` with status 143, or ``KeyboardInterrupt``. A second signal gets through
-    at once, for an environment may hang; so does Ctrl-C while gradient steps are being compiled, for in a terminal it ends
-    the compiler's processes as well. A checkpoint that can't be written, on a full disk for example, is a warning:
-    training goes on, and the checkpoint before stays.
+    The callback calls :meth:`ResumableAlgorithm.save_checkpoint`, on a schedule and on signals. SIGTERM, which pre-empting
+    schedulers send, and Ctrl-C have the step finished and a checkpoint written. Then the process ends with a message that
+    says how to go on: ``SystemExit`` with status 143, or ``KeyboardInterrupt``. A second signal ends the process at once,
+    because an environment may hang. Ctrl-C also does so while gradient steps are being compiled, because in a terminal it
+    ends the compiler's processes as well. If a checkpoint can't be written, on a full disk for example, the callback warns,
+    training goes on, and the checkpoint before it stays.
 
     :param directory: folder in which the checkpoints are written
-    :param every: environment steps between two of them
-    :param keep: how many of the latest ones stay
-    :param notes: called for each one, makes what is to be kept with it, see ``save_checkpoint``
-    :param on_signals: whether to act on SIGTERM and Ctrl-C; only the main thread can
-    :param at_start: whether to make one before the first step, so that there always is one
+    :param every: number of environment steps between two checkpoints
+    :param keep: number of checkpoints to keep, the latest ones
+    :param notes: function without arguments, called for each checkpoint, whose value is kept with it (anything that JSON can
+        hold); ``None`` for no notes
+    :param on_signals: whether to act on SIGTERM and Ctrl-C, which is possible in the main thread only
+    :param at_start: whether to write a checkpoint before the first step, so that there is one from the start
     :raises ValueError: if ``every`` or ``keep`` is not positive
     """
 
@@ -72,7 +74,7 @@ class ExactCheckpointCallback(BaseCallback):
         self._caught = None
         if self.on_signals and threading.current_thread() is threading.main_thread():
             self._handlers = {number: signal.signal(number, self._catch) for number in _SIGNALS}
-            self.model.learn_scope.callback(self._release_signals)  # after an error as well
+            self.model.learn_scope.callback(self._release_signals)  # so that they are released after an error as well
             self.model.learn_scope.push(self._save_after_all)
 
     def _catch(self, number: int, frame: FrameType | None) -> None:
@@ -88,7 +90,7 @@ class ExactCheckpointCallback(BaseCallback):
         )
 
     def _save_after_all(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
-        """Ctrl-C in a terminal reaches the environments' processes as well, which end, so that the step can't be finished."""
+        """Save after Ctrl-C in a terminal, which ends the environments' processes as well: the step can't be finished."""
         if isinstance(error, EnvironmentFailedError) and self._caught is not None:
             self._end_process(self._caught)
 

@@ -1,4 +1,4 @@
-"""Collecting data: every step that was taken is stored and none is invented, whoever stops, interrupts or interferes."""
+"""The loop that collects data: it stores each step that was taken, and no other, whoever stops or interrupts it."""
 
 import warnings
 from collections.abc import Callable
@@ -22,26 +22,26 @@ from sb3_gac.checks.arguments import check_train_freq
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.source import ReplaySource
 
-#: Options of our replay buffers that say how to sample, not what is stored
+#: Options of this package's replay buffers that say how to sample, not what is stored
 SAMPLING_OPTIONS = ("n_steps", "gamma", "sequence_length", "burn_in", "mask_truncations")
 
 
 class OtherNumberOfEnvironmentsError(AssertionError, ValueError):
-    """The replay buffer was filled by as many environments as the model does not have. SB3 raises AssertionError here."""
+    """The replay buffer was filled by another number of environments than the model has. SB3 raises AssertionError here."""
 
 
 class DataCollection(OffPolicyAlgorithm):
     """
-    SB3's loop in another order: a step is stored before callbacks see it, so that one which ends ``learn``, raises, or
-    evaluates on the training environments takes nothing away and adds nothing.
+    SB3's loop in another order: a step is stored before callbacks see it.
 
-    A rollout that was ended by a callback is gone on with by the next ``learn(..., reset_num_timesteps=False)``: together
-    they do what one would have done.
+    A callback may end ``learn``, raise an error, or evaluate on the training environments: no transition is lost, and no
+    wrong one is stored. If a callback ends a rollout, the next ``learn(..., reset_num_timesteps=False)`` goes on with the
+    rollout: the two calls together do what a single one would have done.
     """
 
     #: Attributes that collecting changes
     collected = ("_episode_num", "_rollout_steps", "_rollout_episodes", "_last_original_obs")
-    #: Steps of each environment, and episodes, of the rollout under way
+    #: Number of steps of each environment, and of episodes, in the rollout under way
     _rollout_steps = 0
     _rollout_episodes = 0
     _replay_source: ReplaySource | None = None
@@ -58,7 +58,7 @@ class DataCollection(OffPolicyAlgorithm):
 
     @property
     def replay_source(self) -> ReplaySource:
-        """What the replay buffer gets of the environments."""
+        """The source of what the replay buffer stores, for the present environments."""
         assert self.env is not None
         if self._replay_source is None or self._replay_source.env is not self.env:
             self._replay_source = ReplaySource(self.env)
@@ -67,7 +67,7 @@ class DataCollection(OffPolicyAlgorithm):
 
     @property
     def sampling_env(self) -> Any:
-        """What is to be passed to ``ReplayBuffer.sample``."""
+        """The argument ``env`` for ``ReplayBuffer.sample``, which normalises the samples; ``None`` without normalisation."""
         return None if self.env is None else self.replay_source.sampling_env
 
     def _check_replay_source(self, source: ReplaySource) -> None:
@@ -89,7 +89,9 @@ class DataCollection(OffPolicyAlgorithm):
 
     def _check_what_is_held(self, buffer: ReplayBuffer, source: ReplaySource) -> None:
         """
-        :raises ValueError: if what is stored was normalised when it was seen, and what is to be stored is not, or the reverse
+        Check that the replay buffer goes on with the kind of observations that it holds.
+
+        :raises ValueError: if stored observations are normalised and those to come are raw, or the reverse
         """
         normalised = source.in_the_way is not None
         held = getattr(buffer, "holds_normalised", normalised) if buffer.size() else normalised
@@ -106,7 +108,7 @@ class DataCollection(OffPolicyAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        See SB3's ``set_env``; as long as nothing is in the replay buffer, the number of environments may be another one.
+        See SB3's ``set_env``; while the replay buffer is empty, the number of environments may change.
 
         :raises ValueError: if the replay buffer was filled by another number of environments
         """
@@ -124,15 +126,15 @@ class DataCollection(OffPolicyAlgorithm):
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         if isinstance(self.replay_buffer, HerReplayBuffer):
-            self.replay_buffer.env = self.env  # which rewards goals: SB3 would ask the one before
-        _ = self.replay_source  # which may refuse, or warn
+            self.replay_buffer.env = self.env  # whose compute_reward rewards goals; SB3 would ask the environments before
+        _ = self.replay_source  # a look at it, which may raise or warn
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         """
-        See SB3's ``load_replay_buffer``; how the buffer is sampled is the model's to say, not the file's.
+        See SB3's ``load_replay_buffer``; the model's arguments say how the buffer is sampled, not the file.
 
         :raises ValueError: naming the observation entries whose spaces are not the model's, or if another number of
-            environments filled it; the buffer stays what it was
+            environments filled the buffer; the model then keeps the buffer that it had
         """
         before = self.replay_buffer
         try:
@@ -152,7 +154,13 @@ class DataCollection(OffPolicyAlgorithm):
     # --- checkpoints ------------------------------------------------------------------------------------------------
 
     def save_data(self, root: Path) -> tuple[dict[str, Any], list[str]]:
-        """Of the replay buffer, only what has changed is written."""
+        """
+        Write the rows of the replay buffer that have changed since the last checkpoint.
+
+        :param root: folder of all checkpoints of a run
+        :return: state of the buffer besides its rows, and the names of all blocks of rows
+        :raises TypeError: if there is no replay buffer, or it is of another class than this package's
+        """
         buffer = self.replay_buffer
         if buffer is None:
             raise TypeError("There is no replay buffer to write down: set_env() gives one to a model that was loaded without.")
@@ -165,7 +173,12 @@ class DataCollection(OffPolicyAlgorithm):
         return buffer.bookkeeping() | {"blocks": self._saved_blocks.names}, self._saved_blocks.names
 
     def restore_data(self, root: Path, saved: dict[str, Any]) -> None:
-        """The replay buffer as it was, and the action noise, which SB3 resets at each ``learn``."""
+        """
+        Restore the replay buffer, and keep the restored action noise, which SB3 would reset at the next ``learn``.
+
+        :param root: folder of all checkpoints of a run
+        :param saved: first value that :meth:`save_data` returned
+        """
         buffer = self.replay_buffer
         assert isinstance(buffer, CompactDictReplayBuffer)
         names = saved.pop("blocks")
@@ -176,7 +189,7 @@ class DataCollection(OffPolicyAlgorithm):
     # --- episodes ---------------------------------------------------------------------------------------------------
 
     def _setup_learn(self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any) -> Any:
-        """A resumed action noise goes on."""
+        """See SB3's ``_setup_learn``; a resumed action noise goes on instead of starting anew."""
         if self.replay_buffer is None and self.env is not None:
             self.replay_buffer = self._make_replay_buffer()
         if self.replay_buffer is not None:
@@ -190,7 +203,7 @@ class DataCollection(OffPolicyAlgorithm):
         return result
 
     def cut_episodes(self) -> None:
-        """The environments are about to be reset: what was stored last is not continued by what comes next."""
+        """End the episodes under way in the replay buffer, because the environments are about to be reset."""
         if isinstance(self.replay_buffer, CompactDictReplayBuffer):
             self.replay_buffer.mark_reset()
         elif isinstance(self.replay_buffer, HerReplayBuffer):
@@ -199,7 +212,7 @@ class DataCollection(OffPolicyAlgorithm):
                 self.replay_buffer.truncate_last_trajectory()
 
     def keep_first_observations(self) -> None:
-        """The environments were just reset: ``_last_obs`` is their first observation."""
+        """Keep the first observations after a reset, ``_last_obs``, in the form in which they are to be stored."""
         assert isinstance(self._last_obs, dict)
         self._last_original_obs = self.replay_source.observation(self._last_obs)
 
@@ -220,7 +233,7 @@ class DataCollection(OffPolicyAlgorithm):
         callback.on_rollout_start()
         continue_training = True
         while continue_training and should_collect_more_steps(train_freq, self._rollout_steps, self._rollout_episodes):
-            if env is not self.env:  # a callback has set others
+            if env is not self.env:  # a callback has set other environments
                 env, replay_buffer, action_noise = self.env, self.replay_buffer, self.action_noise  # type: ignore[assignment]
             self.reset_if_used_elsewhere(env)
             actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
@@ -247,9 +260,9 @@ class DataCollection(OffPolicyAlgorithm):
 
     def _count_episodes(self, dones: np.ndarray, action_noise: ActionNoise | None, log_interval: int | None) -> bool:
         """
-        :param dones: whether an episode has ended, shape (n_envs,)
-        :param action_noise: starts anew there
-        :param log_interval: episodes between two logs
+        :param dones: booleans, true where an episode has ended, shape (n_envs,)
+        :param action_noise: noise that starts anew where an episode has ended; ``None`` for none
+        :param log_interval: number of episodes between two logs; ``None`` for no logs
         :return: whether a log is due
         """
         due = False
@@ -273,7 +286,7 @@ class DataCollection(OffPolicyAlgorithm):
         assert isinstance(new_obs, dict)
         source = self.replay_source
         self._check_what_is_held(replay_buffer, source)
-        following = source.observation(new_obs)  # of the next episode where one has ended
+        following = source.observation(new_obs)  # the next episode's first observation, where an episode has ended
         next_obs = {key: values.copy() for key, values in following.items()} if np.any(dones) else following
         for index in np.flatnonzero(dones):
             final = source.final(infos[index])
@@ -285,7 +298,7 @@ class DataCollection(OffPolicyAlgorithm):
         self._last_obs, self._last_original_obs, self._last_episode_starts = new_obs, following, np.array(dones)
 
     def _excluded_save_params(self) -> list[str]:
-        of_the_data = ["_rollout_steps", "_rollout_episodes"]  # steps that a file of the model leaves behind
+        of_the_data = ["_rollout_steps", "_rollout_episodes"]  # of the rollout under way, which a model's file does not hold
         of_files = ["_saved_blocks", "_resumed_noise"]
         return [*super()._excluded_save_params(), "_replay_source", *of_the_data, *of_files]
 

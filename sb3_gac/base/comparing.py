@@ -1,4 +1,4 @@
-"""Two policies of an algorithm, compared by the returns of the episodes that each has acted in."""
+"""Comparison of two policies of an algorithm by the returns of the episodes in which each has acted."""
 
 from abc import abstractmethod
 from typing import Any
@@ -10,22 +10,26 @@ from sb3_gac.base.hooks import EpisodeHooks
 
 class ReturnComparison(EpisodeHooks):
     """
-    Every ``compare_every`` environment steps, the mean returns of two policies' latest ``window`` episodes, as Teacher-Guided
-    RL has it (arXiv 2307.03186). Neither the warm-up nor frozen policies count.
+    Compares the mean returns of two policies' latest ``window`` episodes every ``compare_every`` environment steps.
+
+    Teacher-Guided RL compares policies in this way (arXiv 2307.03186). Episodes with actions of the warm-up or of frozen
+    policies do not count.
     """
 
     compare_every: int
     window: int
-    #: Role of a policy -> returns of its latest episodes, the two that are compared
+    #: Role of each of the two compared policies -> returns of its latest episodes
     returns: dict[str, list[float]]
     next_comparison: int
 
     def start_comparing(self, first: str, second: str, compare_every: int, window: int) -> None:
         """
-        :param first: role of a policy
-        :param second: role of the other one
-        :param compare_every: environment steps between two comparisons
-        :param window: episodes of each that are compared
+        Begin to collect the returns of two policies.
+
+        :param first: role of one policy
+        :param second: role of the other policy
+        :param compare_every: number of environment steps between two comparisons
+        :param window: number of latest episodes of each policy whose returns are compared
         """
         self.compare_every, self.window = compare_every, window
         self.returns, self.next_comparison = {first: [], second: []}, compare_every
@@ -33,7 +37,9 @@ class ReturnComparison(EpisodeHooks):
     @abstractmethod
     def compare(self, difference: float) -> None:
         """
-        :param difference: mean return of the first policy, less that of the second
+        Called after each comparison.
+
+        :param difference: mean return of the first policy minus that of the second
         """
 
     def on_episode_end(self, env: int, episode_return: float, role: str | None) -> None:

@@ -1,4 +1,4 @@
-"""Whether gradient steps are compiled: as ``compile`` says or, if it says "auto", where it is possible and pays."""
+"""The decision whether gradient steps are compiled: as ``compile`` says, or on "auto" where compiling is possible and pays."""
 
 import warnings
 from abc import abstractmethod
@@ -17,17 +17,17 @@ class Compilation(BaseAlgorithm):
     """
     Decides, when ``learn`` begins, whether gradient steps are compiled; ``train`` without ``learn`` compiles on request alone.
 
-    A model that was taken up with ``resume`` goes on with what it had, for the bits of a run depend on it.
+    A model that comes from ``resume`` keeps the decision of the run before, because results depend on it to the bit.
     """
 
     compile: bool | str
     policy: AsymmetricPolicy
     programs: dict[Any, Any]
-    #: What the last ``learn`` decided, and why, in a sentence
+    #: The decision of the last ``learn`` and its reason, as a sentence; empty unless ``compile`` is "auto"
     compile_decision: str = ""
     _compiles_on_auto = False
     _failed_to_compile = False
-    #: Whether this model was made by ``resume``, and has not begun to learn since
+    #: Whether this model comes from ``resume`` and has not begun to learn since
     _resumed = False
 
     @property
@@ -38,16 +38,18 @@ class Compilation(BaseAlgorithm):
     @abstractmethod
     def gradient_steps_in(self, steps: int) -> int:
         """
-        :param steps: environment steps to come, of all environments together
-        :return: about how many gradient steps come with them
+        An estimate of the gradient steps in a stretch of training.
+
+        :param steps: number of environment steps to come, in all environments together
+        :return: approximate number of gradient steps that come with them
         """
 
     def decide_compilation(self) -> None:
-        """Before training begins; what is decided is printed if ``verbose`` is 1 or more, and kept in a sentence."""
+        """Decide before training begins; :attr:`compile_decision` keeps the decision, printed if ``verbose`` is 1 or more."""
         before = self._compiles_on_auto if self._resumed else None
         self._resumed = self._failed_to_compile = False
         if self.compile != AUTO:
-            self._compiles_on_auto = bool(self.compile)  # which a checkpoint keeps
+            self._compiles_on_auto = bool(self.compile)  # kept in checkpoints
             self.compile_decision = ""
             return
         self._compiles_on_auto, why = self._decide(before)
@@ -57,8 +59,8 @@ class Compilation(BaseAlgorithm):
 
     def _decide(self, before: bool | None) -> tuple[bool, str]:
         """
-        :param before: what was decided for the run that this model goes on with, if it does
-        :return: whether to compile, and why
+        :param before: decision of the run that this model goes on with; ``None`` for a new run
+        :return: whether to compile, and the reason in words
         """
         if before is False:
             return False, "as before the run was stopped"
@@ -80,6 +82,8 @@ class Compilation(BaseAlgorithm):
 
     def check_can_compile(self) -> None:
         """
+        Check that gradient steps can be compiled.
+
         :raises CannotCompileError: naming what stands in the way: a kind of network, an optimiser or torch's version
         """
         if any(self.policy.rnn_types.values()):
@@ -96,7 +100,11 @@ class Compilation(BaseAlgorithm):
                 )
 
     def _compiling_failed(self, error: Exception) -> None:
-        """Of a program, on "auto": the gradient steps under way end as they began, and later ones are not compiled."""
+        """
+        Warn that compiling failed, where ``compile`` is "auto"; later rounds of gradient steps are not compiled.
+
+        :param error: error of the compiler
+        """
         if not self._failed_to_compile:
             reason = str(error).strip().splitlines()[0]
             warnings.warn(

@@ -1,4 +1,4 @@
-"""What an algorithm does when its environments fail, are others than before, or are used by somebody else: nothing is lost."""
+"""Training that goes on, with all its data, when environments fail, are replaced, or are used from outside the training."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -26,30 +26,30 @@ from sb3_gac.checks.values import as_sentence, check_same_spaces
 
 class FaultTolerance(BaseAlgorithm):
     """
-    Environments are guarded, see :mod:`sb3_gac.checks.environments`; a fault ends the episode and costs nothing else.
+    Guards the environments, see :mod:`sb3_gac.checks.environments`: a fault ends the episode and costs nothing else.
 
-    After one, the model can be saved, and ``learn(..., reset_num_timesteps=False)`` goes on from reset environments.
+    After a fault the model can be saved, and ``learn(..., reset_num_timesteps=False)`` goes on from reset environments.
     """
 
     restored_arguments: ClassVar[tuple[str, ...]]
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
     policy: AsymmetricPolicy
-    #: Guard of the environments that were last used from here, and what it had counted by then
+    #: Guard of the environments that training used last, and the number of uses that the guard had counted by then
     _last_use: tuple[EnvironmentGuard | None, int] = (None, 0)
     _used_elsewhere_said = False
     begin_episodes: Callable[[int], None]
     _change_arguments: Callable[[dict[str, Any]], None]
-    #: The environments are about to be reset: what was stored last is not continued by what comes next
+    #: Called before the environments are reset: ends the episodes under way in the stored data
     cut_episodes: Callable[[], None]
-    #: The environments were just reset: what is to be stored of ``_last_obs``
+    #: Called after the environments were reset: keeps what is to be stored of ``_last_obs``
     keep_first_observations: Callable[[], None]
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         """
-        Whatever environment the model is given comes through here.
+        Wrap, check and guard environments; all environments that the model is given come through here.
 
-        :raises ValueError: see :func:`check_environment`
+        :raises ValueError: naming what the environment lacks, see :func:`check_environment`
         """
         check_environment(env)
         wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
@@ -80,17 +80,18 @@ class FaultTolerance(BaseAlgorithm):
         """
         See SB3's ``load``. Without ``env`` there is no replay buffer, until :meth:`set_env` gives one.
 
-        :param path: of the file
-        :param env: to learn on; their number may be another than before
-        :param device: "auto", "cpu", "cuda", ...
-        :param custom_objects: attribute -> value, in place of what the file holds
-        :param print_system_info: of this system and of that on which the model was saved
-        :param force_reset: start new episodes
-        :param given: arguments of the constructor, which take the place of those that the model was saved with, and
+        :param path: path of the model's file, or an open file
+        :param env: environments to learn on, in any number; ``None`` for a model that only acts
+        :param device: device of the networks: "auto", "cpu", "cuda", ...
+        :param custom_objects: attribute -> value, in place of values in the file
+        :param print_system_info: whether to print versions of the software, now and when the model was saved
+        :param force_reset: whether the next ``learn`` starts new episodes
+        :param given: arguments of the constructor in place of those that the model was saved with, and
             ``strict_deployment``
+        :return: loaded model
         :raises TypeError: naming what is no argument
         :raises ValueError: naming the observation entries whose spaces have changed since the model was saved, arguments
-            that can't be changed, or the algorithm if the file is another one's
+            that can't be changed, or the algorithm if the file holds another one's model
         """
         given = present_names(cls, given, "load()")
         custom_objects = dict(custom_objects or {})
@@ -123,7 +124,7 @@ class FaultTolerance(BaseAlgorithm):
     # --- episodes ---------------------------------------------------------------------------------------------------
 
     def learn(self, *args: Any, **kwargs: Any) -> Self:
-        """See SB3's ``learn``. After an interrupt, as by Ctrl-C, the next one starts with a reset of the environments."""
+        """See SB3's ``learn``. After an interrupt such as Ctrl-C, the next ``learn`` begins with a reset of environments."""
         try:
             return super().learn(*args, **kwargs)  # type: ignore[safe-super]
         except BaseException as error:
@@ -147,7 +148,7 @@ class FaultTolerance(BaseAlgorithm):
             return super().collect_rollouts(*args, **kwargs)  # type: ignore[misc]
 
     def note_reset(self) -> None:
-        """The environments were just reset: ``_last_obs`` is their first observation."""
+        """Begin new episodes after a reset of the environments, whose first observations are ``_last_obs``."""
         assert self.env is not None
         self.keep_first_observations()
         self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
@@ -155,18 +156,27 @@ class FaultTolerance(BaseAlgorithm):
         self.note_use()
 
     def note_use(self) -> None:
-        """Whatever was done to the environments so far was done from here."""
+        """Note that training itself made all uses of the environments that were counted so far."""
         assert self.env is not None
         guard = guard_of(self.env)
         self._last_use = (guard, guard.uses)
 
     def used_elsewhere(self, env: VecEnv) -> bool:
-        """Whether somebody else has stepped or reset the environments since the last use, or they are others than then."""
+        """
+        Whether training has to begin new episodes, because it was not the last to use the environments.
+
+        :param env: environments that training is about to step
+        :return: whether they were stepped or reset from outside the training since its last use, or are other environments
+        """
         guard = guard_of(env)
         return self._last_use != (guard, guard.uses)
 
     def reset_if_used_elsewhere(self, env: VecEnv) -> None:
-        """Episodes under way end where somebody else has stepped or reset the environments, or they are others than before."""
+        """
+        Begin new episodes, with a warning, if the environments were used from outside the training or were replaced.
+
+        :param env: environments that training is about to step
+        """
         if self._last_obs is not None and not self.used_elsewhere(env):
             return
         if self._last_obs is not None and not self._used_elsewhere_said:
@@ -183,7 +193,7 @@ class FaultTolerance(BaseAlgorithm):
 
     @contextmanager
     def _step_named(self) -> Iterator[None]:
-        """An error ends the episode: the next ``learn()`` resets the environments and keeps the rest."""
+        """Have an error end the episodes, so that the next ``learn`` resets the environments, and name the step in it."""
         try:
             yield
         except BaseException as error:
@@ -199,10 +209,11 @@ class FaultTolerance(BaseAlgorithm):
 @contextmanager
 def networks_named(path: Any, given: list[str]) -> Iterator[None]:
     """
-    An error of networks that do not fit says what may be the reason.
+    Explain an error about networks that do not fit by the arguments that may be the reason.
 
-    :param path: that the networks come from
-    :param given: names of the arguments that are others than in the file
+    :param path: path of the file that the networks come from
+    :param given: names of the arguments that replace those in the file
+    :raises ValueError: in place of the error, with the explanation
     """
     try:
         yield
@@ -217,9 +228,11 @@ def networks_named(path: Any, given: list[str]) -> Iterator[None]:
 
 def check_same_spaces_as(model: Any, other: Any, whose: str) -> None:
     """
-    :param model: has observation and action space
-    :param other: has such as well
-    :param whose: the other ones are, for the message
+    Check that two objects have the same observation space and the same action space.
+
+    :param model: model, or another object with ``observation_space`` and ``action_space``
+    :param other: object with ``observation_space`` and ``action_space`` to compare with the model's
+    :param whose: name of what the other spaces belong to, for the message, such as "environment"
     :raises ValueError: naming the entries that differ
     """
     check_same_spaces("Observation", model.observation_space, other.observation_space, whose)

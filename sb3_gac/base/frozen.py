@@ -1,4 +1,4 @@
-"""Policies that are there already: a teacher that is asked and never trained."""
+"""Frozen policies: teachers, which are asked for their actions and never trained."""
 
 import random
 from collections.abc import Iterator
@@ -23,12 +23,11 @@ from sb3_gac.math.distributions import TanhGaussian
 
 class FrozenPolicy(nn.Module):
     """
-    The policy with which a trained model collected its data, on full observations; a copy, which
-    nothing trains.
+    A copy of the policy with which a trained model collected its data. It reads full observations and is never trained.
 
-    :param model: of this package, or SB3's SAC on a Dict space
-    :param name: of the argument, for messages
-    :raises TypeError: if the model is another one
+    :param model: model of this package, or SB3's SAC on a Dict space
+    :param name: name of the argument that the model was given as, for messages
+    :raises TypeError: if the model is of another kind
     :raises ValueError: if its policy has a memory
     """
 
@@ -36,7 +35,7 @@ class FrozenPolicy(nn.Module):
         super().__init__()
         if not (isinstance(model, SAC) or isinstance(getattr(model, "policy", None), AsymmetricPolicy)):
             raise TypeError(f"{name} must be a model of sb3_gac, or SB3's SAC on a Dict space, got {type(model).__name__}.")
-        self.policy = deepcopy(model.policy)  # the model itself may train on
+        self.policy = deepcopy(model.policy)  # because the model itself may go on training
         self.trained_normalised = bool(getattr(model, "trained_normalised", False))
         if isinstance(self.policy, AsymmetricPolicy) and (self.policy.remembers or any(self.policy.rnn_types.values())):
             raise ValueError(f"{name} has a memory, and it is asked about single transitions: train one without.")
@@ -46,8 +45,10 @@ class FrozenPolicy(nn.Module):
     @th.no_grad()
     def forward(self, obs: PyTorchObs) -> Any:
         r"""
-        :param obs: full observation, (\*E, ...) of each entry
-        :return: distribution of actions, shapes (\*E, A)
+        The distribution of the policy's actions.
+
+        :param obs: full observation, each entry of shape (\*E, ...), where ``*E`` are any leading dimensions
+        :return: distribution of actions, its tensors of shape (\*E, A)
         """
         policy: Any = self.policy
         if isinstance(policy, AsymmetricPolicy):
@@ -66,12 +67,15 @@ def load_frozen_policy(
     name: str = "teacher",
 ) -> FrozenPolicy:
     """
-    :param source: a trained model, or the path of one of this package's that was saved
-    :param observation_space: of the environment; the teacher must know all of its entries
-    :param action_space: of the environment
-    :param device: where it is to be asked
-    :param name: of the argument, for messages
-    :raises ValueError: if its spaces are others
+    Make a frozen policy of a trained model.
+
+    :param source: trained model, or the path of a saved model of this package
+    :param observation_space: observation space of the environment, which must have all entries of the teacher's space
+    :param action_space: action space of the environment
+    :param device: device on which the policy computes
+    :param name: name of the argument that the model was given as, for messages
+    :return: frozen policy
+    :raises ValueError: if the teacher's entries or actions have other spaces than the environment's
     """
     model = _loaded(Path(source), device, name) if isinstance(source, (str, Path)) else source
     frozen = FrozenPolicy(model, name).to(device)
@@ -92,13 +96,13 @@ def _loaded(path: Path, device: th.device, name: str) -> BaseAlgorithm:
         raise ValueError(
             f"{name}={str(path)!r} is no model of a class that can be imported: pass the loaded model itself."
         ) from None
-    with _same_random_numbers():  # those of who asks, which a model's seed would start again
+    with _same_random_numbers():  # because loading a model sets its seed
         return kind.load(path, device=device)
 
 
 @contextmanager
 def _same_random_numbers() -> Iterator[None]:
-    """Random numbers go on as if none had been drawn, or seeds set, in between."""
+    """Keep the random numbers of Python, numpy and torch as if none were drawn, and no seeds set, within the context."""
     states = random.getstate(), np.random.get_state()
     with th.random.fork_rng():
         yield

@@ -1,4 +1,4 @@
-"""What an algorithm's guider would do, for evaluations."""
+"""Actions of an algorithm's guider, for evaluations."""
 
 import numpy as np
 from gymnasium import spaces
@@ -22,14 +22,15 @@ class GuiderPrediction(BaseAlgorithm):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, BehaviourState]:
         """
-        The guider's action; needs the full observation. Arguments and result are those of ``predict``.
+        The guider's action, which needs the full observation. Arguments and result are those of ``predict``.
 
-        :param observation: single or batched
-        :param state: what a recurrent guider's last call returned, ``None`` at the start
-        :param episode_start: true where an episode starts, shape (B,)
-        :param deterministic: mode instead of a sample
+        :param observation: full observation, one or a batch
+        :param state: state that the last call returned, for a recurrent guider; ``None`` at the start
+        :param episode_start: booleans, true where an episode starts, shape (B,)
+        :param deterministic: whether to take the distribution's mode instead of a sample
         :return: action in the environment's range, and the state for the next call
-        :raises ValueError: naming the entry that is missing, does not fit its space, or is not as many as the others
+        :raises ValueError: naming the entry that is missing, does not fit its space, or whose batch size differs from the
+            others'
         """
         check_is_observation(observation)
         self.policy.check_seen_by("guider", observation, "predict_guider()")

@@ -1,4 +1,4 @@
-"""Who acts in each environment, what the episode under way has returned so far, and what an algorithm does about it."""
+"""Hooks that algorithms override, called after each step and episode, and the state of episodes that they are told."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,36 +10,40 @@ from sb3_gac.base.policy import AsymmetricPolicy
 
 
 class EpisodeHooks(BaseAlgorithm):
-    """:meth:`on_step` and :meth:`on_episode_end`, for algorithms to fill in."""
+    """Calls :meth:`on_step` and :meth:`on_episode_end`, which do nothing until an algorithm overrides them."""
 
     policy: AsymmetricPolicy
-    #: Of each environment: role of the policy that acts, return of the episode so far, whether actions in it were uniform
+    #: For each environment: role of the policy that acts, return of the episode so far, whether warm-up actions were in it
     acting: Sequence[str] = ()
     _returns_so_far: Any = None
     _has_warmed_up: Any = None
 
     def on_step(self) -> None:
-        """After each step of the environments, once it is stored."""
+        """Called after each step of the environments, once the step is stored."""
 
     def on_episode_end(self, env: int, episode_return: float, role: str | None) -> None:
         """
-        After an episode's last step, once it is stored and before :meth:`on_step`.
+        Called after an episode's last step, once the step is stored and before :meth:`on_step`.
 
-        :param env: number of the environment
-        :param episode_return: sum of the rewards as they are stored, that is, before normalisation
-        :param role: of the policy that has acted; ``None`` if actions of the warm-up were among its own
+        :param env: index of the environment
+        :param episode_return: sum of the episode's rewards before normalisation
+        :param role: role of the policy that acted in the episode; ``None`` if some actions were the warm-up's
         """
 
     def begin_episodes(self, n_envs: int) -> None:
         """
-        :param n_envs: number of environments, in each of which an episode begins
+        Begin an episode in every environment.
+
+        :param n_envs: number of environments
         """
         self.acting = [self.policy.roles.behaviour] * n_envs
         self._returns_so_far, self._has_warmed_up = np.zeros(n_envs), np.zeros(n_envs, dtype=bool)
 
     def call_hooks(self, dones: np.ndarray) -> None:
         """
-        :param dones: where an episode has ended with the step that was just stored, shape (n_envs,)
+        Call the hooks after a step was stored.
+
+        :param dones: booleans, true where that step ended an episode, shape (n_envs,)
         """
         for index in np.flatnonzero(dones).tolist():
             role = None if self._has_warmed_up[index] else self.acting[index]

@@ -1,12 +1,12 @@
 """
-Where training starts from: what another policy does, cloned by the deployed one, or another model's networks.
+Starting points for training: behaviour of another policy, cloned by the deployed one, or networks of another model.
 
 Behaviour cloning (Pomerleau 1991) and DAgger (Ross et al. 2011, arXiv 1011.0686)::
 
     teacher = AsymmetricSAC.load("full_state")
     shown = demonstrate(teacher, env, 20_000)
     clone_behaviour(model, shown)
-    for _ in range(3):  # what the student meets, as the teacher would have acted there
+    for _ in range(3):  # observations that the student meets, with the actions that the teacher would take there
         shown = shown + demonstrate(teacher, env, 5_000, student=model)
         clone_behaviour(model, shown)
     model.learn(100_000)
@@ -32,23 +32,29 @@ HELD_OUT = 0.1
 
 class Demonstrations(NamedTuple):
     """
-    What a policy does. They add up; those of a file or of another program are made of its arrays.
+    Observations, and the actions that a policy takes on them. ``+`` joins the demonstrations of two sources; those of a file
+    or of another program are made of its arrays.
 
-    :param observations: entry -> N of them, at least the entries that the student reads
-    :param actions: in the environment's range, shape (N, A), or numbers of actions, shape (N,)
+    :param observations: entry -> N values, shape (N, ...), for at least the entries that the student reads
+    :param actions: actions in the environment's range, shape (N, A), or numbers of discrete actions, shape (N,)
     """
 
     observations: Mapping[str, np.ndarray]
     actions: np.ndarray
 
     def __add__(self, other: Any) -> "Demonstrations":
-        """All of both."""
+        """
+        Join two sets of demonstrations, by the entries that both have.
+
+        :param other: further demonstrations
+        :return: all demonstrations of both
+        """
         keys = [key for key in self.observations if key in other.observations]
         joined = {key: np.concatenate([self.observations[key], other.observations[key]]) for key in keys}
         return Demonstrations(joined, np.concatenate([self.actions, other.actions]))
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of demonstrations."""
         return len(self.actions)
 
 
@@ -56,13 +62,15 @@ def demonstrate(
     teacher: BaseAlgorithm, env: VecEnv, n_steps: int, student: BaseAlgorithm | None = None, deterministic: bool = True
 ) -> Demonstrations:
     """
-    :param teacher: a trained model of this package or of SB3; of GAC and its like it is the guider that shows
-    :param env: environment to act in, from a reset on; it gives all entries that the teacher reads
-    :param n_steps: environment steps of all environments together, rounded up
-    :param student: who acts, while the teacher only says what it would have done (DAgger); by default the teacher acts
-    :param deterministic: whether the teacher shows its most likely action, instead of a sample
-    :return: what was observed, and the teacher's action for each
-    :raises ValueError: if ``n_steps`` is less than one
+    Collect demonstrations of a teacher.
+
+    :param teacher: trained model of this package or of SB3; where it has a guider, the guider's actions are shown
+    :param env: environments to act in, from a reset on, whose observations have all entries that the teacher reads
+    :param n_steps: number of steps of all environments together, rounded up to whole steps of each
+    :param student: model that acts, while the teacher only says what it would have done (DAgger); ``None`` for the teacher
+    :param deterministic: whether the teacher shows its most likely action instead of a sample
+    :return: all observations met, with the teacher's action on each
+    :raises ValueError: if ``n_steps`` is less than 1
     """
     check_integer("n_steps", n_steps, 1)
     show: Any = getattr(teacher, "predict_guider", teacher.predict)
@@ -90,22 +98,24 @@ def clone_behaviour(
     seed: int = 0,
 ) -> dict[str, float]:
     """
-    Train a model's deployed policy to do as it was shown, before ``learn``: its most likely action by least squares, or the
-    choice's log-likelihood. A Gaussian's standard deviation, critics and the guider stay as they are, so a residual guider
-    starts at what was cloned. A tenth of the demonstrations is held out to tell how well it does.
+    Train a model's deployed policy on demonstrations, before ``learn`` (behaviour cloning).
 
-    Critics know nothing of the cloned policy at first. Its first gradient steps in ``learn`` may unlearn it: give critics time
-    by ``learning_starts`` and, where it can be, ``policy_delay``.
+    Where actions are continuous, the loss is the squared error of the policy's most likely action; where they are discrete,
+    it is their negative log-likelihood. A Gaussian's standard deviation, the critics and the guider stay as they are, so a
+    residual guider starts at the cloned policy. A tenth of the demonstrations is held out to measure the result.
 
-    :param model: a model of this package, without a memory
-    :param demonstrations: what is learned from, see :func:`demonstrate`
-    :param gradient_steps: number of Adam's steps
-    :param batch_size: rows of the demonstrations in each step
+    Critics know nothing of the cloned policy at first, and the policy's first gradient steps in ``learn`` may unlearn what
+    was cloned. ``learning_starts`` and, where it can be set, ``policy_delay`` give the critics time.
+
+    :param model: model of this package, whose deployed policy has no memory
+    :param demonstrations: demonstrations to learn from, see :func:`demonstrate`
+    :param gradient_steps: number of gradient steps, by Adam
+    :param batch_size: number of demonstrations in each gradient step
     :param learning_rate: Adam's step size
-    :param seed: number that decides what is held out, and the batches
-    :return: "before" and "after": the mean squared error of actions in [-1, 1], or the share of other choices, on what was
-        held out
-    :raises TypeError: if the model is of another kind
+    :param seed: seed of the choice of held-out demonstrations and of batches
+    :return: "before" and "after" -> error on the held-out demonstrations: the mean squared error of actions in [-1, 1], or
+        the fraction of discrete actions that differ
+    :raises TypeError: if the model is not of this package
     :raises ValueError: if the policy has a memory, or demonstrations do not fit it
     """
     check_integer("gradient_steps", gradient_steps, 1)
@@ -137,10 +147,10 @@ def clone_behaviour(
 
 def copy_networks(model: BaseAlgorithm, source: BaseAlgorithm, networks: Mapping[str, str]) -> None:
     """
-    Start from what another model has learned: its networks' parameters in place of a model's own, targets included.
+    Copy the parameters of another model's networks into a model's own networks and their targets.
 
-    :param model: a model of this package
-    :param source: likewise, with networks of the same sizes on the same entries
+    :param model: model of this package, whose networks are changed
+    :param source: model of this package, whose networks have the same sizes and read the same entries
     :param networks: network of ``model`` -> network of ``source``, such as ``{"guider": "actor"}``
     :raises ValueError: if there is no such network, or its parameters are of other shapes
     """
@@ -177,7 +187,7 @@ def _shape(state: Mapping[str, th.Tensor], key: str) -> tuple[int, ...] | str:
 
 
 def _as_tensors(policy: AsymmetricPolicy, demonstrations: Demonstrations) -> tuple[dict[str, th.Tensor], th.Tensor]:
-    """Entries that the deployed policy reads, and actions as it computes them."""
+    """The entries that the deployed policy reads, and the actions in its own range, [-1, 1], or numbers of discrete ones."""
     if len(demonstrations) < 2:
         raise ValueError(f"demonstrations must be at least two, got {len(demonstrations)}.")
     keys = policy.role_keys[policy.roles.deployed]
@@ -204,8 +214,8 @@ def _as_tensors(policy: AsymmetricPolicy, demonstrations: Demonstrations) -> tup
 
 
 def _are_in(space: spaces.Space, actions: np.ndarray) -> np.ndarray:
-    """Whether each row is an action, shape (N,)."""
-    if actions.shape[1] != int(np.prod(space.shape or ())):  # of a choice, 1
+    """Whether each row of ``actions`` is in the space, shape (N,)."""
+    if actions.shape[1] != int(np.prod(space.shape or ())):  # 1 for a discrete action
         return np.zeros(len(actions), dtype=bool)
     if isinstance(space, spaces.Box):
         return np.all((actions >= space.low.ravel()) & (actions <= space.high.ravel()), axis=1)
@@ -214,7 +224,7 @@ def _are_in(space: spaces.Space, actions: np.ndarray) -> np.ndarray:
 
 
 def _loss(policy: AsymmetricPolicy, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-    """Cross-entropy of a choice, or the squared distance of the most likely action in [-1, 1]."""
+    """Cross-entropy of discrete actions, or squared error of the most likely action in [-1, 1]."""
     distribution = policy.deployed.distribution(observations)
     if isinstance(distribution, Categorical):
         return nn.functional.cross_entropy(distribution.logits, actions)

@@ -1,4 +1,4 @@
-"""Models from files that say whose they are."""
+"""Loading of models whose algorithm is found in their files."""
 
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,11 @@ MODEL = "model.zip"
 
 def model_file(path: Path) -> Path:
     """
-    :param path: of a model's file, with or without its suffix ``.zip``, or of a run's directory that has one
-    :return: the file
-    :raises FileNotFoundError: if there is none
+    Find the file of a model.
+
+    :param path: path of a model's file, with or without its suffix ``.zip``, or of a run's directory
+    :return: path of the file
+    :raises FileNotFoundError: if there is no such file
     """
     if path.is_dir():
         if not (path / MODEL).exists():
@@ -29,10 +31,12 @@ def model_file(path: Path) -> Path:
 
 def class_of_model(path: Path, device: th.device | str = "cpu") -> Any:
     """
-    :param path: of a file that the ``save`` of one of this package's algorithms, or of a subclass, wrote
-    :param device: where its tensors are put while it is read
-    :return: the class of the model in it
-    :raises ValueError: if it is another file, or its class can't be imported
+    The class of the model in a file.
+
+    :param path: path of a file that ``save`` of one of this package's algorithms, or of a subclass, wrote
+    :param device: device that the file's tensors are put on while it is read
+    :return: class of the model
+    :raises ValueError: if the file does not name an algorithm of this package, or the class can't be imported
     """
     data, _, _ = load_from_zip_file(path, device=device, load_data=True)
     saved = data or {}
@@ -44,9 +48,11 @@ def class_of_model(path: Path, device: th.device | str = "cpu") -> Any:
 
 def load_model(path: Path, device: th.device | str = "auto") -> Any:
     """
-    :param path: of a file that an algorithm's ``save`` wrote
-    :param device: to act on
-    :return: the model, of whichever algorithm
-    :raises ValueError: if it is another file, or its class can't be imported
+    Load a model of whichever algorithm.
+
+    :param path: path of a file that an algorithm's ``save`` wrote
+    :param device: device of the model's networks
+    :return: loaded model
+    :raises ValueError: if the file does not name an algorithm of this package, or the class can't be imported
     """
     return class_of_model(path).load(path, device=device)

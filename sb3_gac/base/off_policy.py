@@ -1,4 +1,4 @@
-"""What off-policy algorithms with a privileged view share: arguments, their checks, acting and save lists."""
+"""The base of off-policy algorithms with a privileged view: arguments, their checks, and the train loop."""
 
 import warnings
 from abc import abstractmethod
@@ -41,59 +41,62 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
 
-    A subclass names its policy class in ``policy_aliases`` and writes one gradient step. Its constructor names the arguments
-    that are its own alone, see :class:`OffPolicyArguments`: each is kept as the attribute of its name, set before
-    ``super().__init__()``, which sets everything up. ``argument_checks`` says what each may be, ``_check_arguments`` what
-    depends on others.
+    A subclass names its policy class in ``policy_aliases`` and writes one gradient step, :meth:`update`. Its constructor
+    names only the arguments of its own, see :class:`OffPolicyArguments`. It keeps each as the attribute of its name before
+    it calls ``super().__init__()``, which sets everything up. ``argument_checks`` says what each argument may be by itself,
+    ``_check_arguments`` what combinations there may be.
 
-    The arguments up to ``target_entropy``, which may come by position, and from ``stats_window_size`` on, are SB3's SAC's.
+    The arguments up to ``target_entropy``, which may be given by position, and those from ``stats_window_size`` on are those
+    of SB3's SAC.
 
     :param policy: "MultiInputPolicy", or a subclass of the policy class of that name
-    :param env: environment with Dict observations and Box actions
+    :param env: environment with Dict observations and Box or Discrete actions; ``None`` in ``load`` alone
     :param learning_rate: step size for policies, critics and the entropy temperature; a number or a schedule
-    :param buffer_size: transitions kept
-    :param learning_starts: steps of uniform warm-up
-    :param batch_size: transitions per gradient step
-    :param tau: Polyak coefficient of the target critics
+    :param buffer_size: number of transitions that the replay buffer holds
+    :param learning_starts: number of environment steps of the warm-up, whose actions are uniform
+    :param batch_size: number of transitions per gradient step
+    :param tau: Polyak coefficient of the target networks
     :param gamma: discount factor
-    :param train_freq: steps, or (n, "step" | "episode"), between two rounds of training
-    :param gradient_steps: gradient steps per round; -1 for as many as there were environment steps
-    :param action_noise: added to the behaviour policy's actions
-    :param replay_buffer_class: default :class:`CompactDictReplayBuffer`, which stores each observation once
-    :param replay_buffer_kwargs: keyword arguments for it
+    :param train_freq: steps of each environment between two rounds of gradient steps; or (n, "step" | "episode")
+    :param gradient_steps: number of gradient steps per round; -1 for as many as there were environment steps
+    :param action_noise: noise that is added to the behaviour policy's actions; ``None`` for none
+    :param replay_buffer_class: class of the replay buffer; ``None`` for :class:`CompactDictReplayBuffer`, which stores each
+        observation once, or for recurrent networks its subclass :class:`EpisodeReplayBuffer`
+    :param replay_buffer_kwargs: keyword arguments of the replay buffer's class
     :param optimize_memory_usage: argument of replay buffers of other classes, see SB3
-    :param n_steps: rewards summed up in a critic's target before it bootstraps
-    :param ent_coef: entropy temperature: "auto", "auto_<start value>" or a number
-    :param target_update_interval: gradient steps between two updates of the targets
-    :param target_entropy: entropy that the temperature aims at, in nats: "auto", "sac" or a number, see
+    :param n_steps: number of rewards that a critic's target sums up before it bootstraps
+    :param ent_coef: entropy temperature: "auto" or "auto_<start value>" for a learned one, or a number
+    :param target_update_interval: number of gradient steps between two updates of the target networks
+    :param target_entropy: entropy that a learned temperature aims at, in nats: "auto", "sac" or a number, see
         :func:`sb3_gac.networks.heads.resolve_target_entropy`
-    :param max_grad_norm: bound on the gradient norm of each network; ``None`` for none
-    :param policy_delay: gradient steps to each step of a policy; critics take all
-    :param update_every: network -> gradient steps to each step of its own, "critic" standing for all critics
-    :param behaviour: which policy collects the data, by name, or name -> share of episodes, a number or a schedule; by
-        default that of the algorithm; a frozen teacher has the name of its argument
-    :param behaviour_per: "episode", or "environment" for shares of the environments
-    :param recording: path of what :func:`sb3_gac.write_recording` wrote of another run: its actions are taken, warm-up
-        included, in environments that are made alike and return what they did, which is checked; ``None`` for own data
-    :param random_shift: pixels by which gradient steps shift the images that the deployed policy reads, at random and each on
-        its own, up to so many in each direction (DrQ's augmentation, there 4); 0 for none
+    :param max_grad_norm: bound on the gradient norm of each network; ``None`` for no bound
+    :param policy_delay: number of gradient steps for each step of a policy's network; critics take a step in each
+    :param update_every: network -> number of gradient steps for each step of this network; "critic" stands for all critics
+    :param behaviour: policy that collects the data: its name, or name -> share of episodes, a number or a schedule. A frozen
+        teacher has the name of its argument. ``None`` for the policy that the algorithm itself names
+    :param behaviour_per: unit of the shares in ``behaviour``: "episode" or "environment"
+    :param recording: path of a file that :func:`sb3_gac.write_recording` wrote of another run, whose actions are taken, those
+        of the warm-up included. The environments must be made like that run's; their rewards are compared with the recorded
+        ones. ``None`` for actions of the model's own
+    :param random_shift: largest shift, in pixels and in each direction, of the images that the deployed policy reads; each
+        image in a batch is shifted at random by itself (DrQ's augmentation, which has 4 pixels). 0 for no shift
     :param lr_scales: network -> multiple of ``learning_rate``; "critic" stands for all critics, "memory" for the memories of
-        recurrent networks, on top of their networks' own
+        recurrent networks, whose multiple comes on top of their network's
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others;
-        "critic" stands for all critics: where ``privileged`` is the whole state, spare them the sensor noise with
-        ``{"critic": ["privileged"]}``
-    :param compile: compile losses and gradients: half a minute at the start (less the next time, from a cache), faster
-        gradient steps from then on; needs a C++ compiler on the CPU. "auto" decides when ``learn`` begins: where it is
-        possible, and 10,000 gradient steps or more are to come
-    :param mixed_precision: matrix products of losses and gradients in bfloat16, which pays at 256 units and more on
-        hardware that has it, with ``compile``
-    :param stats_window_size: episodes averaged in rollout statistics
-    :param tensorboard_log: log directory, ``None`` for no log
+        "critic" stands for all critics. Where ``privileged`` is the whole state, ``{"critic": ["privileged"]}`` spares the
+        critics the sensor noise
+    :param compile: whether to compile gradient steps: about half a minute at the start (less the next time, from a cache),
+        and faster steps from then on. On the CPU it needs a C++ compiler. "auto" decides when ``learn`` begins: steps are
+        compiled where that is possible and 10,000 or more are to come
+    :param mixed_precision: whether to compute the matrix products of losses and gradients in bfloat16, which pays at 256
+        units and more on hardware that has it, with ``compile``
+    :param stats_window_size: number of episodes that rollout statistics average over
+    :param tensorboard_log: directory for TensorBoard's log; ``None`` for no log
     :param policy_kwargs: keyword arguments of the policy class
-    :param verbose: 0 silent, 1 information, 2 debug
+    :param verbose: level of messages: 0 for none, 1 for information, 2 for debugging
     :param seed: number from which all pseudo-random generators start; ``None`` for another one each time
-    :param device: "auto", "cpu", "cuda", ...
-    :param _init_setup_model: build the networks at construction
+    :param device: device of the networks: "auto", "cpu", "cuda", ...
+    :param _init_setup_model: whether to build the networks at construction
     """
 
     argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = OFF_POLICY_CHECKS
@@ -146,17 +149,17 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         super()._setup_model()
         self.chooses_behaviour = self._make_behaviour()
         if self.env is not None:
-            _ = self.replay_source  # which may refuse, or warn
+            _ = self.replay_source  # a look at it, which may raise or warn
 
     def _prepare_data(self) -> dict[str, Any]:
         if self.replay_buffer_class is None:
             self.replay_buffer_class = EpisodeReplayBuffer if self.is_recurrent else CompactDictReplayBuffer
         self._fit_action_noise()
-        if self.replay_buffer is None and self.env is not None:  # to act takes no memory for training
+        if self.replay_buffer is None and self.env is not None:  # a model without environments only acts, and needs no buffer
             self.replay_buffer = self._make_replay_buffer()
         as_given = {name: getattr(self, name) for name in ("n_steps", "replay_buffer")}
         if issubclass(self.replay_buffer_class, CompactDictReplayBuffer):
-            self.n_steps = 1  # SB3 warns that it can't pass n_steps on to this buffer: it was
+            self.n_steps = 1  # SB3 warns that it can't pass n_steps on to this buffer, which has it already
         if self.replay_buffer is None:
             self.replay_buffer = object()  # type: ignore[assignment]  # SB3 would make one
         return as_given
@@ -182,7 +185,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
 
     def check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
-        """See :meth:`ResumableAlgorithm.check_fixed_arguments`; how the replay buffer stores numbers is one of them."""
+        """See :meth:`ResumableAlgorithm.check_fixed_arguments`; the replay buffer's storage options are fixed as well."""
         super().check_fixed_arguments(given, before)
         if "replay_buffer_kwargs" in given and "replay_buffer_kwargs" in before:
             for option in ("storage_dtype", "frame_stacks"):
@@ -190,7 +193,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
                 check_unchanged(f"replay_buffer_kwargs' {option}", now, then, "resume()")
 
     def make_coefficients(self) -> dict[str, Coefficient]:
-        """The entropy temperature, in most algorithms."""
+        """The algorithm's coefficients by name: in most algorithms the entropy temperature alone."""
         return {
             "ent_coef": make_coefficient(
                 "ent_coef", self.ent_coef, ENT_COEF_START, ENT_COEF_BOUNDS, self.lr_schedule(1), self.device
@@ -203,7 +206,9 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
 
     def _check_entropy_counts(self) -> None:
         """
-        :raises ValueError: if there is no temperature, and an argument was given that would do nothing
+        Check that arguments of the entropy term were given only where there is such a term.
+
+        :raises ValueError: if there is no entropy temperature, and an argument was given that would do nothing
         """
         if "ent_coef" in self.coefficients:
             return
@@ -231,7 +236,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         )
 
     def _replay_buffer_options(self) -> dict[str, Any]:
-        """Arguments of the replay buffer's class, those that are arguments of the algorithm included."""
+        """Keyword arguments of the replay buffer's class, with those that the algorithm itself was given."""
         assert self.replay_buffer_class is not None
         ours = issubclass(self.replay_buffer_class, CompactDictReplayBuffer)
         return {**({"n_steps": self.n_steps, "gamma": self.gamma} if ours else {}), **self.replay_buffer_kwargs}
@@ -254,35 +259,37 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """See SB3's ``OffPolicyAlgorithm.learn``; TensorBoard's runs are named after the class by default."""
+        """See SB3's ``OffPolicyAlgorithm.learn``; by default TensorBoard's runs have the name of the class."""
         tb_log_name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     @property
     def history_length(self) -> int:
-        """Steps before each transition that the batches of the next gradient steps have, see ``Batch.histories``."""
+        """Number of steps before each transition that ``Batch.histories`` holds in the next gradient steps; 0 for none."""
         return 0
 
     @property
     def at_rest(self) -> frozenset[str]:
-        """Networks that the next gradient steps leave as they are, whatever is minimised: those of another phase."""
+        """Networks that the next gradient steps leave as they are, because another phase of training is theirs."""
         return frozenset()
 
     @abstractmethod
     def update(self, batch: Batch) -> Metrics:
         """
-        One gradient step of all networks and coefficients; targets follow by themselves.
+        One gradient step of all networks and coefficients; target networks are updated elsewhere.
 
-        :param batch: B transitions
-        :return: to log under "train/"
+        :param batch: B transitions, or sequences of them
+        :return: name -> metric, scalars to log under "train/"
         """
 
     # --- training ---------------------------------------------------------------------------------------------------
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """
+        A round of gradient steps on batches from the replay buffer.
+
         :param gradient_steps: number of gradient steps
-        :param batch_size: transitions per step, B
+        :param batch_size: number of transitions per gradient step, B
         """
         if self._waits_for_an_episode():
             return
@@ -296,7 +303,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
                 batch = self._sample_batch(batch_size)
                 self._resting = at_rest.union(name for name, every in update_every.items() if self._n_updates % every)
                 follow_now = targets_follow and (self._n_updates + 1) % self.target_update_interval == 0
-                if self.compiles:  # targets and all
+                if self.compiles:  # the update of targets as well
                     step = self._update_with_targets if follow_now else self.update
                     history.append(self._compiled(step.__name__, step, batch))
                 else:
@@ -311,7 +318,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         return metrics
 
     def _waits_for_an_episode(self) -> bool:
-        """Whether there is nothing yet to learn from; said once. (A full buffer without a whole episode is an error.)"""
+        """Whether there is no whole episode to learn from yet, with a warning. (In a full buffer, that is an error.)"""
         buffer = self.replay_buffer
         waits = isinstance(buffer, EpisodeReplayBuffer) and not buffer.full and buffer.n_episodes == 0
         if waits and not self._waiting:
@@ -324,7 +331,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         return waits
 
     def gradient_steps_in(self, steps: int) -> int:
-        """See :meth:`Compilation.gradient_steps_in`; episodes, if they are counted, are taken for 1,000 steps long."""
+        """See :meth:`Compilation.gradient_steps_in`; where ``train_freq`` counts episodes, they count as 1,000 steps each."""
         assert isinstance(self.train_freq, TrainFreq)
         trained = max(steps - max(int(self.learning_starts) - self.num_timesteps, 0), 0)
         if self.gradient_steps < 0:
@@ -333,7 +340,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         return trained * self.gradient_steps // (self.train_freq.frequency * round_length)
 
     def example_of_data(self) -> dict[str, th.Tensor]:
-        """A batch of observation entries and rewards as the networks see them, for the diagnosis of a divergence."""
+        """Entries of a batch of observations and its rewards, as the networks see them, for the diagnosis of a divergence."""
         batch = self._sample_batch(self.batch_size)
         assert isinstance(batch.observations, dict)
         return {**batch.observations, "reward": batch.rewards}

@@ -1,4 +1,4 @@
-"""Who takes the actions of an off-policy algorithm: chance, the behaviour policy, a frozen one, or a recording."""
+"""The source of an off-policy algorithm's actions: the uniform warm-up, a policy, a frozen policy, or a recording."""
 
 from copy import deepcopy
 from typing import ClassVar
@@ -18,9 +18,10 @@ from sb3_gac.replay.buffer import CompactDictReplayBuffer
 
 class OffPolicyActing(EpisodeHooks, DataCollection):
     """
-    Actions for the environments, in [-1, 1] for the buffer; each environment's policy stays to the episode's end.
+    Chooses the actions for the environments. In each environment one policy acts until the episode's end.
 
-    The attributes without a value are those of :class:`sb3_gac.base.algorithm.AsymmetricAlgorithm`, which stands beside it.
+    The attributes without a value are those of :class:`sb3_gac.base.algorithm.AsymmetricAlgorithm`, the other base of
+    off-policy algorithms.
     """
 
     policy_class: type[AsymmetricPolicy]
@@ -36,12 +37,12 @@ class OffPolicyActing(EpisodeHooks, DataCollection):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Uniform during warm-up, then the behaviour policy, which sees everything.
+        Actions for the next step: uniform ones during the warm-up, then those of the policies that act.
 
-        :param learning_starts: steps of warm-up
-        :param action_noise: added to the scaled action, which is then clipped
+        :param learning_starts: number of environment steps of the warm-up
+        :param action_noise: noise added to actions in [-1, 1], which are then clipped; ``None`` for none
         :param n_envs: number of environments
-        :return: action for the environments, and the same scaled to [-1, 1] for the buffer
+        :return: actions for the environments, and the same actions scaled to [-1, 1] for the replay buffer
         """
         action, scaled_action = self._next_action(learning_starts, action_noise, n_envs)
         self._behaviour_state = self.policy.with_actions(self._behaviour_state, scaled_action)
@@ -69,7 +70,7 @@ class OffPolicyActing(EpisodeHooks, DataCollection):
         for name in self.frozen.keys() & set(self.acting):
             rows = np.array([role == name for role in self.acting])
             scaled_action[rows] = self.policy.frozen_action(self.frozen[name], self._last_obs)[rows]
-        if warms_up:  # the memory was brought up
+        if warms_up:  # by now the policies' memories are up to date
             return super()._sample_action(learning_starts, action_noise, n_envs)
         if action_noise is not None:
             scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
@@ -80,28 +81,31 @@ class OffPolicyActing(EpisodeHooks, DataCollection):
 
     def choose_acting(self, episode_start: np.ndarray) -> list[str]:
         """
-        Which policy acts in each environment, see ``behaviour``; to be overridden by algorithms with a rule of their own.
+        The policy that acts in each environment, see ``behaviour``; an algorithm with a rule of its own overrides this method.
 
-        :param episode_start: true where an episode starts, shape (n_envs,)
-        :return: role of the policy, or name of a frozen one, of each environment; who has acted stays to the episode's end
+        A policy that has begun an episode acts until its end.
+
+        :param episode_start: booleans, true where an episode starts, shape (n_envs,)
+        :return: role of the policy that acts in each environment, or name of a frozen policy
         """
         return self.chooses_behaviour.choose(self.acting, episode_start, self._current_progress_remaining)
 
     def _in_environments_range(self, action: np.ndarray) -> np.ndarray:
         """
-        :param action: in [-1, 1], or one of a number
+        :param action: actions in [-1, 1], or numbers of discrete actions, shape (n_envs, ...)
+        :return: actions in the environment's range
         """
         return self.policy.unscale_action(action) if isinstance(self.action_space, spaces.Box) else action
 
     def call_hooks(self, dones: np.ndarray) -> None:
-        """See :meth:`EpisodeHooks.call_hooks`; first, a recorded step must be what it was."""
+        """See :meth:`EpisodeHooks.call_hooks`; with a recording, the step's rewards are compared with the recorded ones."""
         if self._recorded is not None:
             assert isinstance(self.replay_buffer, CompactDictReplayBuffer)
             self._recorded.check(self.num_timesteps // self.n_envs - 1, self.replay_buffer.newest_rewards())
         super().call_hooks(dones)
 
     def _fit_action_noise(self) -> None:
-        """Noise that SB3 has made for another number of environments becomes noise for as many as there are."""
+        """Make action noise that SB3 has vectorised fit the present number of environments."""
         noise = self.action_noise
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:
             base = deepcopy(noise.base_noise)

@@ -1,4 +1,4 @@
-"""What on-policy algorithms with a privileged view share: arguments, their checks, and the train loop."""
+"""The base of on-policy algorithms with a privileged view: arguments, their checks, and the train loop."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
@@ -24,39 +24,39 @@ from sb3_gac.checks.values import check_fraction, check_integer, check_not_negat
 
 class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # type: ignore[misc]
     """
-    Base of the algorithms that learn from what their present policy has just collected, as PPO does.
+    Base of the algorithms that learn from rollouts of their present policy, as PPO does.
 
-    A subclass writes ``update(batch)``, with a minibatch of SB3's ``DictRolloutBufferSamples``, whose actions are what the
-    behaviour policy's distribution has drawn (before tanh). The arguments up to ``vf_coef``, which may come by position,
-    and from ``stats_window_size`` on, are SB3's PPO's.
+    A subclass writes :meth:`update`, one gradient step on a minibatch of SB3's ``DictRolloutBufferSamples``. Continuous
+    actions in it are values before tanh, as drawn from the behaviour policy's distribution. The arguments up to
+    ``vf_coef``, which may be given by position, and those from ``stats_window_size`` on are those of SB3's PPO.
 
     :param policy: "MultiInputPolicy", or a subclass of the policy class of that name
     :param env: environment with Dict observations and Box or Discrete actions
-    :param learning_rate: a number or a schedule
-    :param n_steps: steps of each environment in a rollout
-    :param batch_size: transitions per gradient step
-    :param n_epochs: passes over each rollout
+    :param learning_rate: step size for all networks; a number or a schedule
+    :param n_steps: number of steps of each environment in a rollout
+    :param batch_size: number of transitions per gradient step
+    :param n_epochs: number of passes over each rollout
     :param gamma: discount factor
-    :param gae_lambda: trade-off of bias and variance in advantages
-    :param clip_range: how far a ratio of probabilities may count, epsilon; a number or a schedule
+    :param gae_lambda: lambda of generalised advantage estimation, which trades bias for variance, from 0 to 1
+    :param clip_range: epsilon: ratios of probabilities are clipped to [1 - epsilon, 1 + epsilon]; a number or a schedule
     :param normalize_advantage: whether advantages are normalised in each minibatch
-    :param ent_coef: weight of the entropy
-    :param vf_coef: weight of the value's loss
-    :param max_grad_norm: bound on the norm of the gradient of all networks together; ``None`` for none
-    :param reward_scale: multiplies the rewards that are learned from
-    :param unroll_length: steps after which advantages bootstrap; ``None`` for the whole rollout
+    :param ent_coef: weight of the entropy in the loss
+    :param vf_coef: weight of the value function's loss
+    :param max_grad_norm: bound on the norm of the gradient of all networks together; ``None`` for no bound
+    :param reward_scale: factor of the rewards that are learned from
+    :param unroll_length: number of steps after which advantages bootstrap; ``None`` for the whole rollout
     :param lr_scales: network -> multiple of ``learning_rate``
     :param role_keys: role -> observation entries, by default ``partial`` for the deployed policy and all for the others
-    :param compile: compile losses and gradients; needs a C++ compiler on the CPU. "auto" decides when ``learn`` begins: where
-        it is possible, and 10,000 gradient steps or more are to come
-    :param mixed_precision: matrix products of losses and gradients in bfloat16
-    :param stats_window_size: episodes averaged in rollout statistics
-    :param tensorboard_log: log directory, ``None`` for no log
+    :param compile: whether to compile gradient steps, which needs a C++ compiler on the CPU. "auto" decides when ``learn``
+        begins: steps are compiled where that is possible and 10,000 or more are to come
+    :param mixed_precision: whether to compute the matrix products of losses and gradients in bfloat16
+    :param stats_window_size: number of episodes that rollout statistics average over
+    :param tensorboard_log: directory for TensorBoard's log; ``None`` for no log
     :param policy_kwargs: keyword arguments of the policy class
-    :param verbose: 0 silent, 1 information, 2 debug
+    :param verbose: level of messages: 0 for none, 1 for information, 2 for debugging
     :param seed: number from which all pseudo-random generators start; ``None`` for another one each time
-    :param device: "auto", "cpu", "cuda", ...
-    :param _init_setup_model: build the networks at construction
+    :param device: device of the networks: "auto", "cpu", "cuda", ...
+    :param _init_setup_model: whether to build the networks at construction
     """
 
     argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {
@@ -127,7 +127,7 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
         One gradient step of all networks.
 
         :param batch: B transitions of the rollout
-        :return: to log under "train/"
+        :return: name -> metric, scalars to log under "train/"
         """
 
     def train(self) -> None:
@@ -156,8 +156,10 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
 
     def advantages(self, batch: DictRolloutBufferSamples) -> th.Tensor:
         """
-        :param batch: B transitions
-        :return: their advantages, normalised on request, shape (B,)
+        The advantages of a minibatch, normalised if ``normalize_advantage`` is true.
+
+        :param batch: B transitions of the rollout
+        :return: advantages, shape (B,)
         """
         if not self.normalize_advantage:
             return batch.advantages

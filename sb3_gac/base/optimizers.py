@@ -1,4 +1,4 @@
-"""Optimisers of networks by role: one for each, which trains what no other network holds before it."""
+"""Optimisers of networks by role: each network has its own, and one of them trains a parameter that several networks hold."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,19 +13,21 @@ from sb3_gac.optim.trained import TrainedParameters
 
 
 class OptimizedPolicy(ActingPolicy):
-    """Acting policies whose networks are trained; a subclass builds the networks, and then the optimisers."""
+    """Acting policies whose networks are trained; a subclass builds the networks and then the optimisers."""
 
     constructor_options: dict[str, Any]
 
     def unclipped(self, role: str) -> int:
         """
-        :param role: a network
-        :return: how many of its last parameters have no say in the clipping of its gradient
+        Number of a network's last parameters whose gradients are left out of its gradient's norm and of clipping.
+
+        :param role: role of the network
+        :return: number of parameter tensors
         """
         return 0
 
     def _build_optimizers(self, lr_schedule: Schedule) -> None:
-        """Each network's own, as the attribute that SB3's SAC has on actor and critic."""
+        """Give each network its optimiser, as the attribute ``optimizer``, which actor and critic of SB3's SAC have."""
         optimizer_class, kwargs = self.optimizer_class, dict(self.optimizer_kwargs)
         if optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in kwargs:
             kwargs.setdefault("fused", True)
@@ -33,7 +35,7 @@ class OptimizedPolicy(ActingPolicy):
         self.trained: dict[str, TrainedParameters] = {}
         there = [role for role in self.roles.all if getattr(self, role) is not None]
         owners: dict[int, str] = {}
-        for role in sorted(there, key=lambda role: role not in self.roles.parts):  # of what several hold, the first one
+        for role in sorted(there, key=lambda role: role not in self.roles.parts):  # parts are first
             for parameter in getattr(self, role).parameters():
                 owners.setdefault(id(parameter), role)
         for role in there:
@@ -45,22 +47,22 @@ class OptimizedPolicy(ActingPolicy):
             self.trained[role].scale_memory(lr_scales[MEMORY])
 
     def _memory_of(self, role: str) -> list[nn.Parameter]:
-        """Parameters of what a network remembers with."""
+        """Parameters of a network's memory; none for a network without one."""
         memory = getattr(getattr(self, role), "memory", None)
         return [] if memory is None else list(memory.parameters())
 
     def refresh_parameters(self, compiled: bool | None = None) -> None:
         """
-        To be called before training and before saving: parameters may have been frozen, see :class:`TrainedParameters`.
+        Take note of which parameters are frozen by now, before training and before saving, see :class:`TrainedParameters`.
 
-        :param compiled: see :meth:`TrainedParameters.refresh`
+        :param compiled: whether the gradient steps to come are compiled; ``None`` if none follow
         """
         for parameters in self.trained.values():
             parameters.refresh(compiled)
 
     @property
     def optimizer_options(self) -> tuple[Any, ...]:
-        """What a step of the optimisers depends on, but for learning rates: frozen parameters and options."""
+        """All that a step of the optimisers depends on except learning rates: frozen parameters and options."""
         groups = [getattr(self, role).optimizer.param_groups[0] for role in self.trained]
         return tuple(
             value if not isinstance(value, list) else tuple(value)
@@ -70,13 +72,15 @@ class OptimizedPolicy(ActingPolicy):
         )
 
     def freeze_as_saved(self) -> None:
-        """To be called when a file has given the optimisers their state."""
+        """Freeze and unfreeze parameters as they were when a file's states of the optimisers were saved."""
         for parameters in self.trained.values():
             parameters.freeze_as_saved()
 
     def scale_learning_rates(self, lr_scales: Mapping[str, float] | None) -> None:
         """
-        :param lr_scales: network -> multiple of the learning rate, in place of those that there were
+        Change the multiples of the learning rate.
+
+        :param lr_scales: network -> multiple of the learning rate, in place of all former multiples; ``None`` for 1 each
         """
         self.constructor_options["lr_scales"] = lr_scales
         scales = resolve_lr_scales(self.roles, lr_scales)

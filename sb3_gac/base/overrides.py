@@ -1,4 +1,4 @@
-"""What may be given to a model that comes from a file: each argument counts, or is refused by name."""
+"""Checks of arguments given to a model that comes from a file: each has its effect, or is refused by name."""
 
 import difflib
 import inspect
@@ -10,15 +10,18 @@ from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.arguments import constructor_arguments, constructor_parameters
 from sb3_gac.checks.values import plain
 
-#: What is no argument of the constructor, and is kept with a model nevertheless
+#: Attributes that are kept with a model although they are no arguments of its constructor
 SETTINGS = ("strict_deployment",)
 PACKAGE = __name__.partition(".")[0]
 
 
 def algorithm_of(kind: type) -> str:
     """
-    :param kind: an algorithm's class
-    :return: name of the algorithm: that of this package which a subclass elsewhere adds to, or that subclass's first own
+    The name of the algorithm that a class is a form of.
+
+    :param kind: class of an algorithm
+    :return: name of its nearest concrete ancestor in this package, itself included; without one, of its furthest concrete
+        ancestor
     """
     concrete = [base for base in kind.__mro__ if hasattr(base, "update") and not inspect.isabstract(base)]
     ours = [base for base in concrete if base.__module__.partition(".")[0] == PACKAGE]
@@ -27,13 +30,15 @@ def algorithm_of(kind: type) -> str:
 
 def check_whose(kind: type, saved: Mapping[str, Any], path: Any) -> None:
     """
-    :param kind: class that is to load a file
-    :param saved: the attributes in the file
-    :param path: of the file, for the message
-    :raises ValueError: if it is another algorithm's
+    Check that a file holds a model of the algorithm that is to load it.
+
+    :param kind: class that is to load the file
+    :param saved: name -> attribute in the file
+    :param path: path of the file, for the message
+    :raises ValueError: if the file holds a model of another algorithm
     """
     name, expected = saved.get("algorithm"), algorithm_of(kind)
-    if name is None:  # of another library, or of an earlier version
+    if name is None:  # the file is another library's, or an earlier version's
         policy_class = saved.get("policy_class")
         aliases: Mapping[str, type] = kind.policy_aliases  # type: ignore[attr-defined]
         base = aliases.get("MultiInputPolicy", AsymmetricPolicy)
@@ -47,10 +52,12 @@ def check_whose(kind: type, saved: Mapping[str, Any], path: Any) -> None:
 
 def check_names(kind: type, given: Iterable[str], where: str) -> None:
     """
-    :param kind: an algorithm's class
-    :param given: names of arguments
-    :param where: they were given, for the message
-    :raises TypeError: naming those that the class does not take, and what may be meant
+    Check that a model can be given these arguments when it is loaded or resumed.
+
+    :param kind: class of an algorithm
+    :param given: names of the arguments
+    :param where: call that the arguments were given to, for the message, such as "load()"
+    :raises TypeError: naming the first argument that the class does not take, and the one that may be meant
     """
     known = [*constructor_arguments(kind), *SETTINGS]
     for name in given:
@@ -60,10 +67,12 @@ def check_names(kind: type, given: Iterable[str], where: str) -> None:
 
 def check_known(kind: type, shared: type, given: Iterable[str]) -> None:
     """
-    :param kind: an algorithm's class
-    :param shared: table of the arguments that its family shares
-    :param given: names of arguments that no constructor of its own has taken
-    :raises TypeError: naming those that are not shared ones either, and what may be meant
+    Check that a constructor was given no unknown arguments.
+
+    :param kind: class of an algorithm
+    :param shared: table of the arguments that on-policy, or off-policy, algorithms share, a key of ``SHARED``
+    :param given: names of the arguments that no subclass's constructor has taken
+    :raises TypeError: naming the first argument that is no shared one either, and the one that may be meant
     """
     for name in given:
         if name not in SHARED[shared].parameters:
@@ -84,11 +93,13 @@ def _unknown(kind: type, name: str, where: str, known: Sequence[str]) -> TypeErr
 
 def check_unchanged(name: str, given: Any, before: Any, where: str) -> None:
     """
-    :param name: of an argument that can't be another than before
-    :param given: its value now
-    :param before: its value in the file
-    :param where: it was given, for the message
-    :raises ValueError: if it is another
+    Check that an argument has the value that it had when the file was written.
+
+    :param name: name of the argument
+    :param given: value of the argument now
+    :param before: value of the argument in the file
+    :param where: call that the argument was given to, for the message, such as "load()"
+    :raises ValueError: if the values differ
     """
     given, before = plain(given), plain(before)
     if isinstance(given, Mapping) and isinstance(before, Mapping):
@@ -106,5 +117,5 @@ def check_unchanged(name: str, given: Any, before: Any, where: str) -> None:
 def _same(one: Any, other: Any) -> bool:
     try:
         return bool(one == other)
-    except ValueError:  # arrays
+    except ValueError:  # arrays are compared by element
         return repr(one) == repr(other)

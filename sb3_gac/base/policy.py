@@ -1,4 +1,4 @@
-"""What policies with a privileged view share: networks by role, target critics, optimisers; as a policy, the deployed one."""
+"""The base of policies with a privileged view: networks by role, target networks and optimisers."""
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -40,38 +40,40 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
     """
     The networks of an algorithm's ``roles``, each reading the observation entries of its role, and their optimisers.
 
-    Each network is the attribute of its role's name, and its target is ``<role>_target``. A subclass names its ``roles``; it
-    overrides :meth:`make_policy` where a policy is of another class, and :meth:`acting_distributions` where policies act
-    relative to each other.
+    As a policy it acts like the deployed one. Each network is the attribute of its role's name, and its target network is
+    ``<role>_target``. A subclass names its ``roles``. It overrides :meth:`make_policy` where a policy's network is of
+    another class, and :meth:`acting_distributions` where policies act relative to each other.
 
-    :param observation_space: Dict
-    :param action_space: Box or Discrete
-    :param lr_schedule: learning rate schedule
-    :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}``, or one for each policy and one for "critic"
-    :param activation_fn: between layers
+    :param observation_space: Dict space of the observations
+    :param action_space: Box or Discrete space of the actions
+    :param lr_schedule: schedule of the learning rate
+    :param net_arch: hidden layer sizes: one list for all networks, ``{"pi": [...], "qf": [...]}``, or one list for each
+        policy and one for "critic"; ``None`` for two layers of 256 units
+    :param activation_fn: class of the activation between layers
     :param role_keys: role -> observation entries, see :func:`sb3_gac.base.roles.resolve_role_keys`
     :param lr_scales: network -> multiple of the learning rate, see :func:`sb3_gac.base.roles.resolve_lr_scales`
-    :param n_critics: size of each critic ensemble
-    :param log_std_bounds: smallest and largest log standard deviation before tanh
-    :param features_extractor_class: encoder, made once per role on the entries of that role; or one for each role, by name
-    :param features_extractor_kwargs: keyword arguments for it
-    :param share_features_extractor: whether the other roles see the deployed policy's features of its entries, as they
-        are, and encode only the other entries themselves; the deployed policy's loss trains that encoder (saves most
-        of the work where ``partial`` is an image). Roles that read none of its entries have an encoder of their own
-    :param normalize_images: divide images by 255
-    :param optimizer_class: optimiser of policies and critics
-    :param optimizer_kwargs: keyword arguments for it, without the learning rate
-    :param rnn_type: "gru" or "lstm" for networks that remember, and then take sequences; or role -> one of them, "critic"
-        standing for all critics and "partial" for every network that reads ``partial`` alone, for a memory where it is
-        needed; by default that of the policy class
-    :param rnn_hidden_size: size of the recurrent layer, which comes after ``net_arch``
+    :param n_critics: number of networks in each critic ensemble
+    :param log_std_bounds: smallest and largest logarithm of the standard deviation before tanh
+    :param features_extractor_class: class of the encoders, of which each role has one on its entries; or role -> class
+    :param features_extractor_kwargs: keyword arguments of that class
+    :param share_features_extractor: whether the other roles take the deployed policy's features of its entries as they are
+        and encode only the other entries themselves, which saves most of the work where ``partial`` is an image. The
+        deployed policy's loss trains the shared encoder. Roles that read none of its entries have an encoder of their own
+    :param normalize_images: whether to divide images by 255
+    :param optimizer_class: class of the optimisers of all networks
+    :param optimizer_kwargs: keyword arguments of that class, without the learning rate
+    :param rnn_type: type of the networks' memories, "gru" or "lstm", with which they take sequences; or role -> type, where
+        "critic" stands for all critics and "partial" for every network that reads ``partial`` alone; ``None`` for the
+        default of the policy class
+    :param rnn_hidden_size: size of the recurrent layer, which comes after the layers of ``net_arch``
     :param rnn_net_arch: hidden layer sizes after the recurrent layer
-    :param softplus_min_std: ``None``, or what is added to softplus of the network's output to give the standard deviation, in
-        place of its exp within ``log_std_bounds``; Brax has 0.001
-    :param initialization: "torch", or "lecun_uniform", Brax's: see :func:`sb3_gac.networks.layers.lecun_uniform_`
+    :param softplus_min_std: smallest standard deviation, to which softplus of the network's output is added (Brax has 0.001);
+        ``None`` for a standard deviation that is exp of the output within ``log_std_bounds``
+    :param initialization: initial weights: "torch" for torch's own, or "lecun_uniform" for Brax's, see
+        :func:`sb3_gac.networks.layers.lecun_uniform_`
     """
 
-    #: Default of the argument of that name
+    #: Value of the argument ``rnn_type`` where it is ``None``
     default_rnn_type: ClassVar[str | None] = None
 
     def __init__(
@@ -141,7 +143,11 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         self._build_optimizers(lr_schedule)
 
     def own_options(self) -> dict[str, Any]:
-        """Constructor arguments of a subclass, which it keeps before it calls this class's constructor."""
+        """
+        Constructor arguments that a subclass adds, by name, for files to hold.
+
+        The subclass keeps them as attributes before it calls this class's constructor.
+        """
         return {}
 
     @property
@@ -153,23 +159,32 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
 
     def make_policy(self, role: str, **arguments: Any) -> RolePolicy:
         """
-        :param role: deployed policy or another one
-        :param arguments: of its network
+        Make the network of a policy.
+
+        :param role: role of the policy
+        :param arguments: keyword arguments of the network's class
+        :return: network
         """
         return Actor(**arguments)
 
     def complete_role_keys(self, role_keys: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
         """
-        :param role_keys: network -> entries, as told or by default
-        :return: network -> entries that it is given
+        Add the observation entries that networks need in any case; a subclass may override this method.
+
+        :param role_keys: network -> entries that it reads by ``role_keys`` or by default
+        :return: network -> all entries that it reads
         """
         return role_keys
 
     def tie_networks(self) -> None:
-        """Once all networks are made: for those that have layers in common."""
+        """Called once all networks are made; a subclass whose networks have layers in common ties them here."""
 
     def has(self, role: str) -> bool:
-        """Whether there is a network for the role, which an ablation may do without."""
+        """
+        Whether there is a network for a role; ablations may lack some.
+
+        :param role: one of ``roles``
+        """
         return True
 
     def _build_networks(self) -> None:
@@ -194,7 +209,7 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
             setattr(self, role, StateValue(**self._role_kwargs(role, shared)))
         self.tie_networks()
         if self.constructor_options["initialization"] == "lecun_uniform":
-            lecun_uniform_(self)  # targets, too, which so stay as what they follow
+            lecun_uniform_(self)  # targets as well, which stay equal to their networks
         write_each_tensor_once(self)
         pairs = self.pairs.values()
         self._followed: list[th.Tensor] = [parameter for network, _ in pairs for parameter in network.parameters()]
@@ -203,7 +218,7 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
 
     @property
     def activation_fn(self) -> type[nn.Module]:
-        """Between layers."""
+        """Class of the activation between layers."""
         return self.constructor_options["activation_fn"]
 
     @property
@@ -221,7 +236,8 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         Constructor arguments of a role's network.
 
         :param role: one of ``roles``
-        :param shared: the deployed policy's encoder, if this role is to use it; without it the role gets one of its own
+        :param shared: encoder of the deployed policy, if this role is to use it; ``None`` for an encoder of the role's own
+        :return: name -> argument
         """
         features_extractor, rest_extractor = shared, None
         if shared is None or not self._sees_deployed(role):
@@ -241,11 +257,11 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
 
     def body_arguments(self, role: str, features_dim: int) -> dict[str, Any]:
         """
-        What comes after a role's encoder: hidden layers, after a memory where the role has one.
+        Constructor arguments for what follows a role's encoder: hidden layers, and a memory if the role has one.
 
-        :param role: a network
-        :param features_dim: of its encoder
-        :return: arguments of the network
+        :param role: role of the network
+        :param features_dim: size of the encoder's output
+        :return: name -> argument
         """
         net_arch, options, rnn_type = self._role_net_arch[role], self.constructor_options, self.rnn_types[role]
         if rnn_type is None:
@@ -257,9 +273,11 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
 
     def make_extractor(self, role: str, keys: Sequence[str]) -> BaseFeaturesExtractor:
         """
-        :param role: a network
-        :param keys: entries that it reads
-        :return: its encoder of them
+        Make an encoder for a role.
+
+        :param role: role of the network
+        :param keys: names of the observation entries to encode
+        :return: encoder of these entries
         """
         space = role_space(self.observation_space, keys)  # type: ignore[arg-type]
         extractor = self._role_extractors[role]
@@ -301,14 +319,14 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
 
     @property
     def side_branch(self) -> tuple[str, ...]:
-        """Networks whose gradient steps read nothing that those of the others change, and change nothing that those read."""
+        """Networks whose gradient steps are independent of those of all others, so that both may run at once."""
         return ()
 
     def update_targets(self, tau: float) -> None:
         """
-        Polyak averaging of the targets, tau theta + (1 - tau) theta_bar; running statistics are copied.
+        Polyak averaging of the target networks, tau theta + (1 - tau) theta_bar; running statistics are copied.
 
-        :param tau: in [0, 1]
+        :param tau: weight of the networks' present parameters theta, in [0, 1]
         """
         polyak_average(self._followed, self._following, tau)
         for network, target in self.pairs.values() if self._has_statistics else ():  # a move to another device replaces them
@@ -316,12 +334,12 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """
-        Put policies and critics in training or evaluation mode; targets stay in evaluation mode.
+        Put policies and critics in training or evaluation mode; target networks stay in evaluation mode.
 
-        :param mode: True for training
+        :param mode: whether the mode is that of training
         """
         for network in [getattr(self, role) for role in self.trained]:
-            if network.training != mode:  # which goes through all of its layers, at every prediction of a guider
+            if network.training != mode:  # train() goes through all layers, which would slow down each prediction
                 network.train(mode)
         self.training = mode
 

@@ -1,4 +1,4 @@
-"""Training on the data of another run: its actions, in environments that then do what they did."""
+"""Training on the data of another run: its recorded actions, in environments that then return the same again."""
 
 from os import PathLike
 
@@ -11,19 +11,21 @@ from sb3_gac.replay.buffer import CompactDictReplayBuffer
 
 def holds_every_step(buffer: ReplayBuffer | None) -> bool:
     """
-    :param buffer: of a model that was trained
-    :return: whether :func:`write_recording` can be done
+    Whether a replay buffer still holds every step that was stored, so that :func:`write_recording` works.
+
+    :param buffer: replay buffer of a trained model, if it has one
+    :return: whether every step of the training is there
     """
     return isinstance(buffer, CompactDictReplayBuffer) and 0 < buffer.n_added == buffer.size()
 
 
 def write_recording(model: OffPolicyAlgorithm, path: str | PathLike) -> None:
     """
-    Write down all actions that a model's data were collected with, and the rewards, for the argument ``recording``.
+    Write the actions and rewards of a model's training to a file, for the argument ``recording`` of another run.
 
-    :param model: trained, with a replay buffer that still holds its first step
-    :param path: file to write, ``.npz``
-    :raises ValueError: if its first steps are no longer there, or the buffer is of another class than this package's
+    :param model: trained model, whose replay buffer still holds its first step
+    :param path: path of the file to write, ``.npz``
+    :raises ValueError: if the first steps are no longer in the replay buffer, or it is of another class than this package's
     """
     buffer = model.replay_buffer
     if not holds_every_step(buffer):
@@ -34,12 +36,12 @@ def write_recording(model: OffPolicyAlgorithm, path: str | PathLike) -> None:
 
 class Recording:
     """
-    What :func:`write_recording` wrote.
+    The actions and rewards of a run, read from the file that :func:`write_recording` wrote.
 
-    :param path: of the file
+    :param path: path of the file
     :param n_envs: number of environments, which must be that of the recorded run
-    :raises FileNotFoundError: if it is not there
-    :raises ValueError: if it is of another number of environments
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if the recorded run had another number of environments
     """
 
     def __init__(self, path: str | PathLike, n_envs: int):
@@ -51,9 +53,11 @@ class Recording:
 
     def actions(self, step: int) -> np.ndarray:
         """
-        :param step: of each environment
-        :return: as the replay buffer has them, shape (n_envs, A)
-        :raises ValueError: if there was no such step
+        The recorded actions of a step.
+
+        :param step: number of steps of each environment before this one
+        :return: actions in the replay buffer's form, in [-1, 1] or numbers of discrete actions, shape (n_envs, A)
+        :raises ValueError: if the recorded run had fewer steps
         """
         if step >= len(self._actions):
             raise ValueError(f"recording ends after {step} steps of each environment: train no longer than that.")
@@ -61,8 +65,10 @@ class Recording:
 
     def check(self, step: int, rewards: np.ndarray) -> None:
         """
-        :param step: of each environment
-        :param rewards: that it has returned, shape (n_envs,)
+        Check that the environments return the recorded rewards.
+
+        :param step: number of steps of each environment before this one
+        :param rewards: rewards of the step, shape (n_envs,)
         :raises ValueError: if they are not the recorded ones
         """
         if not np.array_equal(rewards, self._rewards[step]):

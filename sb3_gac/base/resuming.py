@@ -28,7 +28,7 @@ from sb3_gac.checkpoint.serialization import UntrustedNameError, decode, encode
 from sb3_gac.checkpoint.vec_env import restore_vec_env_state, vec_env_state
 from sb3_gac.checks.arguments import KEPT_AS, constructor_arguments
 
-#: Of what a checkpoint holds, what is encoded
+#: Parts of a checkpoint's state that are encoded as JSON and arrays
 STATES = ("progress", "training_state", "generators", "env", "buffer")
 _STATE, _ARRAYS, _TENSORS = "state.json", "arrays.npz", "tensors.pt"
 
@@ -40,7 +40,7 @@ class ResumableAlgorithm(BaseAlgorithm):
     Files hold JSON, plain arrays and tensors: loading them executes nothing.
     """
 
-    #: Attributes that training changes, besides networks, coefficients and what the data are held in
+    #: Attributes that training changes, besides networks, coefficients and the replay or rollout buffer
     progress: ClassVar[tuple[str, ...]] = (
         "num_timesteps",
         "_total_timesteps",
@@ -60,7 +60,7 @@ class ResumableAlgorithm(BaseAlgorithm):
         "trained_normalised",
         "_compiles_on_auto",
     )
-    #: Arguments that what a checkpoint holds was made with
+    #: Arguments that ``resume`` can't change, because the checkpoint's networks and data were made with them
     fixed_arguments: ClassVar[tuple[str, ...]] = ("policy", "policy_kwargs")
     restored_arguments: ClassVar[tuple[str, ...]]
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
@@ -68,39 +68,39 @@ class ResumableAlgorithm(BaseAlgorithm):
     _change_arguments: Callable[[dict[str, Any]], None]
     note_use: Callable[[], None]
     used_elsewhere: Callable[[VecEnv], bool]
-    #: Given the directory of all checkpoints: what is to be written of the data that training holds, and names of blocks
-    #: that were written there
+    #: Function of the folder of all checkpoints: writes blocks of training data there, and returns the rest of the data and
+    #: the names of all blocks
     save_data: Callable[[Path], tuple[dict[str, Any], list[str]]]
-    #: Given that directory, and what ``save_data`` returned
+    #: Function of that folder and of the data that ``save_data`` returned: restores the training data
     restore_data: Callable[[Path, dict[str, Any]], None]
-    #: What :meth:`save_checkpoint` was given to keep, after :meth:`resume`
+    #: After :meth:`resume`, the notes that :meth:`save_checkpoint` was given
     resumed_notes: Any = None
 
     _resumed: bool
 
-    #: What is to be called when ``learn`` ends, in whatever way
+    #: Callbacks for the end of ``learn``, also for an end by an error
     learn_scope: ExitStack
 
     @property
     def steps_left(self) -> int:
-        """Environment steps of the last ``learn`` that are still to come: what to pass to the next one after a resume."""
+        """Number of environment steps that the last ``learn`` has left, as argument of ``learn`` after :meth:`resume`."""
         return max(self._total_timesteps - self.num_timesteps, 0)
 
     # --- saving -----------------------------------------------------------------------------------------------------
 
     def save_checkpoint(self, directory: str | Path, keep: int = 2, notes: Any = None) -> Path:
         """
-        Write down all that training depends on, where another process finds it with :meth:`resume`.
+        Write a checkpoint of all that training depends on, from which :meth:`resume` goes on in another process.
 
-        To be called between two rounds of training: after ``learn``, or by a callback when a rollout starts, as
-        :class:`sb3_gac.ExactCheckpointCallback` does. Of the replay buffer only what has changed is written.
+        Call this method between two rounds of training: after ``learn``, or in a callback when a rollout starts, as
+        :class:`sb3_gac.ExactCheckpointCallback` does. Of the replay buffer, only changed rows are written.
 
-        :param directory: folder with all checkpoints of this run
-        :param keep: how many of the latest ones stay
-        :param notes: what the caller wants kept with it, anything that JSON can hold, see :attr:`resumed_notes`
-        :return: directory of this checkpoint
-        :raises OSError: if it can't be written; the checkpoints before it are as they were
-        :raises TypeError: if the data are held in what can't be written down, as a replay buffer of another class than this
+        :param directory: folder of all checkpoints of this run
+        :param keep: number of checkpoints to keep, the latest ones
+        :param notes: further data to keep in the checkpoint, anything that JSON can hold, see :attr:`resumed_notes`
+        :return: folder of this checkpoint
+        :raises OSError: if the checkpoint can't be written; the checkpoints before it are as they were
+        :raises TypeError: if the replay buffer can't be written, because it is missing or of another class than this
             package's
         """
         root = Path(directory).absolute()
@@ -127,7 +127,7 @@ class ResumableAlgorithm(BaseAlgorithm):
         return write_checkpoint(root, self.num_timesteps, files, blocks, keep)
 
     def _encoded_arguments(self, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-        """Of the constructor, as far as they can be written down; of the others, what can't be."""
+        """Name of each constructor argument -> its encoded value, or the reason why no file can hold the value."""
         arguments: dict[str, Any] = {}
         for name in constructor_arguments(type(self)):
             try:
@@ -136,7 +136,7 @@ class ResumableAlgorithm(BaseAlgorithm):
                     raise UntrustedNameError("it is a model, and not the path of one")
                 if isinstance(value, TrainFreq):
                     value = (value.frequency, value.unit.value)
-                if name == "policy":  # by its name, if it has one: the class may be the user's own
+                if name == "policy":  # by its alias, if it has one: the class may be the user's own
                     value = next((alias for alias, kind in self.policy_aliases.items() if kind is value), value)
                 arguments[name] = {"value": encode(value, arrays)}
             except (UntrustedNameError, AttributeError, TypeError) as error:
@@ -153,15 +153,16 @@ class ResumableAlgorithm(BaseAlgorithm):
         }
 
     def _tensors(self) -> dict[str, Any]:
-        """State of networks, optimisers and coefficients."""
+        """The states of networks, optimisers and coefficients."""
         _, names = self._get_torch_save_params()
         free = {name: recursive_getattr(self, name).detach() for name in names}
         return {"parameters": self.get_parameters(), "free": free}
 
     def training_state(self) -> dict[str, Any]:
         """
-        What an algorithm's own hooks have gathered, for checkpoints: attributes by name, of numbers, strings, arrays, lists,
-        dicts and deques. :meth:`resume` sets them.
+        Attributes that an algorithm's own hooks change, by name, for checkpoints; :meth:`resume` sets them.
+
+        Values are numbers, strings, arrays, and lists, dicts and deques of such.
         """
         return {}
 
@@ -170,22 +171,21 @@ class ResumableAlgorithm(BaseAlgorithm):
     @classmethod
     def resume(cls, directory: str | Path, env: GymEnv, device: th.device | str = "auto", **given: Any) -> Self:
         """
-        Go on from the latest checkpoint that is whole; a later one that is incomplete or altered is named in a warning.
+        Go on from the latest checkpoint that is whole; a warning names later ones that are incomplete or altered.
 
-        The next ``learn(model.steps_left, reset_num_timesteps=False)`` does what the interrupted one would have done, to
-        the bit where the environments can be put back to where they were; where they can't, a warning says why, and new
+        The next ``learn(model.steps_left, reset_num_timesteps=False)`` does what the interrupted ``learn`` would have done.
+        The two agree to the bit if the state of the environments can be restored. If it can't, a warning says why, and new
         episodes start.
 
-        :param directory: folder that :meth:`save_checkpoint` was given
-        :param env: made like the one before
-        :param device: may be another one
-        :param given: arguments of the constructor, which take the place of those before, and ``strict_deployment``; needed
-            are those that no file can hold, such as functions and classes of your own
-        :return: the model as it was
-        :raises CheckpointError: if no checkpoint is whole, or it is of another algorithm
+        :param directory: folder of all checkpoints of the run, which :meth:`save_checkpoint` was given
+        :param env: environments made like those before
+        :param device: device of the networks, which may be another one than before
+        :param given: arguments of the constructor in place of those before, and ``strict_deployment``; arguments that no
+            file can hold, such as functions and classes of your own, must be among them
+        :return: the model as it was at the checkpoint
+        :raises CheckpointError: if no checkpoint is whole, or the latest one is another algorithm's
         :raises TypeError: naming what is no argument
-        :raises ValueError: naming a needed argument, one that can't be changed, or the entry of a space that is another one
-            now
+        :raises ValueError: naming an argument that is missing or can't be changed, or an entry whose space has changed
         """
         root = Path(directory).absolute()
         path, files = latest_whole(root)
@@ -215,7 +215,13 @@ class ResumableAlgorithm(BaseAlgorithm):
         return model
 
     def check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
-        """Of those that were given: that they are what the checkpoint's networks and buffer were made with."""
+        """
+        Check that given arguments do not differ from those that the checkpoint's networks and buffer were made with.
+
+        :param given: name -> argument that :meth:`resume` was given
+        :param before: name -> argument in the checkpoint
+        :raises ValueError: naming the argument that can't be changed
+        """
         for name in self.fixed_arguments:
             if name in given and name in before:
                 then = self.policy_aliases.get(before[name], before[name]) if name == "policy" else before[name]
@@ -247,10 +253,10 @@ class ResumableAlgorithm(BaseAlgorithm):
         if why:
             warnings.warn(f"Starting new episodes: the environments cannot be restored ({why}).", stacklevel=4)
             self._last_obs = None
-            self.env.seed(int(generators["numpy"][1][0]) % 2**31)  # the same for the same checkpoint
+            self.env.seed(int(generators["numpy"][1][0]) % 2**31)  # the same seed for the same checkpoint
 
     def _restore_generators(self, states: dict[str, Any]) -> None:
-        """Last: whatever else is restored may draw random numbers."""
+        """Restore the random number generators, after all else, which may draw random numbers."""
         th.set_rng_state(th.from_numpy(states["torch"]))
         if th.cuda.is_available() and len(states["cuda"]) == th.cuda.device_count():
             th.cuda.set_rng_state_all([th.from_numpy(state) for state in states["cuda"]])
@@ -259,7 +265,7 @@ class ResumableAlgorithm(BaseAlgorithm):
         self.action_space._np_random = states["action_space"]
 
     def learn(self, *args: Any, **kwargs: Any) -> Self:
-        """See SB3's ``learn``."""
+        """See SB3's ``learn``; the callbacks in :attr:`learn_scope` are called at the end."""
         with ExitStack() as self.learn_scope:
             return super().learn(*args, **kwargs)  # type: ignore[safe-super]
 
@@ -273,8 +279,8 @@ def _qualified_name(algorithm: type) -> str:
 
 def _in_memory(write: Any) -> bytes:
     """
-    :param write: to a file
-    :return: what it wrote
+    :param write: function that writes to an open file
+    :return: content that it wrote
     """
     file = io.BytesIO()
     write(file)
@@ -282,7 +288,15 @@ def _in_memory(write: Any) -> bytes:
 
 
 def _decoded_arguments(stored: dict[str, Any], given: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Those that the checkpoint holds; the others must have been given."""
+    """
+    Decode the arguments that a checkpoint holds.
+
+    :param stored: name -> encoded value, or the reason why the checkpoint can't hold it
+    :param given: name -> argument that ``resume`` was given
+    :param arrays: arrays of the checkpoint by name
+    :return: name -> argument
+    :raises ValueError: naming the arguments that are neither in the checkpoint nor given
+    """
     missing = {name: entry["cannot"] for name, entry in stored.items() if "cannot" in entry and name not in given}
     if missing:
         reasons = "; ".join(f"{name} ({reason})" for name, reason in missing.items())
@@ -291,7 +305,7 @@ def _decoded_arguments(stored: dict[str, Any], given: dict[str, Any], arrays: Ma
 
 
 def _describe_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> dict[str, str]:
-    """Name -> description that is the same if and only if shape, type and bounds are."""
+    """Name of each space -> description, which is the same for two spaces only if shape, type and bounds are the same."""
     assert isinstance(observation_space, spaces.Dict)
     entries = {f'the observation\'s entry "{key}"': space for key, space in observation_space.items()}
     return {name: _describe(space) for name, space in {**entries, "the actions": action_space}.items()}
@@ -301,5 +315,5 @@ def _describe(space: spaces.Space) -> str:
     if not isinstance(space, spaces.Box):
         return str(space)
     low, high = (np.array2string(bound, threshold=8) for bound in (space.low, space.high))
-    all_bounds = checksum(space.low.tobytes() + space.high.tobytes())[:8]  # a long array is shown by its ends
+    all_bounds = checksum(space.low.tobytes() + space.high.tobytes())[:8]  # the text shows only the ends of a long array
     return f"Box of shape {space.shape}, {space.dtype}, within [{low}, {high}] ({all_bounds})".replace("\n", " ")

@@ -1,4 +1,4 @@
-"""Which observation entries each role reads: resolved and checked once, when a model is set up."""
+"""The roles of an algorithm's networks, and settings for each: entries, layers, rates and memories, checked at set-up."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, TypeVar
@@ -23,14 +23,14 @@ class Roles(NamedTuple):
     """
     The networks of an algorithm that are trained, by kind.
 
-    :param deployed: the policy that acts without privileged entries
+    :param deployed: policy that acts without privileged entries
     :param actors: other policies
-    :param critics: ensembles that value actions, each with a target
-    :param target_policies: those policies that have a target as well
-    :param unprivileged: those that see no more than the deployed policy, unless they are told to
-    :param values: networks that value states, without targets
-    :param collects: the policy that acts in training, by default the deployed one
-    :param parts: those parts of networks that an optimiser of their own trains, each an attribute of the policy
+    :param critics: ensembles of Q-functions, each with a target network
+    :param target_policies: those of the policies that have a target network as well
+    :param unprivileged: those of the networks that read only the deployed policy's entries unless ``role_keys`` names others
+    :param values: state-value networks, without target networks
+    :param collects: policy that acts in training; ``None`` for the deployed one
+    :param parts: parts of networks that have an optimiser of their own, each an attribute of the policy
     """
 
     deployed: str
@@ -44,22 +44,22 @@ class Roles(NamedTuple):
 
     @property
     def policies(self) -> tuple[str, ...]:
-        """Those that act, the deployed one first."""
+        """Every policy, the deployed one first."""
         return (self.deployed, *self.actors)
 
     @property
     def others(self) -> tuple[str, ...]:
-        """Every network but the deployed one."""
+        """Every network except the deployed policy's."""
         return (*self.actors, *self.critics, *self.values)
 
     @property
     def networks(self) -> tuple[str, ...]:
-        """Every policy and critic, the deployed one first."""
+        """Every policy, critic and state-value network, the deployed policy first."""
         return (self.deployed, *self.others)
 
     @property
     def all(self) -> tuple[str, ...]:
-        """Whatever has an optimiser of its own: networks, the deployed one first, and parts of them."""
+        """Every network, the deployed policy first, and every part of a network that has an optimiser of its own."""
         return (*self.networks, *self.parts)
 
     @property
@@ -70,7 +70,11 @@ class Roles(NamedTuple):
 
 def check_observation_space(observation_space: spaces.Space) -> spaces.Dict:
     """
-    :raises ValueError: unless the space is a ``Dict`` of entries that can be learned from
+    Check that an observation space is a ``Dict`` of entries that can be learned from.
+
+    :param observation_space: observation space of an environment
+    :return: observation space that was given
+    :raises ValueError: if the space is no such ``Dict``
     """
     if not isinstance(observation_space, spaces.Dict):
         raise ValueError(
@@ -88,14 +92,14 @@ def resolve_role_keys(
     """
     Complete and check the mapping from roles to observation entries.
 
-    By default the deployed policy reads ``partial`` alone, unprivileged roles read what it reads, and every other role reads
-    every entry: a guider must see what its learner sees, noise included, or it cannot stay close to it.
+    By default the deployed policy reads ``partial`` alone, unprivileged roles read the deployed policy's entries, and every
+    other role reads every entry: a guider must see what its learner sees, noise included, or it cannot stay close to it.
 
-    :param observation_space: of the environment
-    :param roles: of the algorithm
-    :param role_keys: role, or "critic" for all critics -> entries, where they differ from the default
+    :param observation_space: observation space of the environment
+    :param roles: roles of the algorithm
+    :param role_keys: role, or "critic" for all critics -> entries, for roles that differ from the default
     :return: role -> entries, for all networks
-    :raises ValueError: if a role or an entry is unknown, an entry list is empty, or there is no ``partial`` entry
+    :raises ValueError: if a role or an entry is unknown, a list of entries is empty, or there is no ``partial`` entry
         for the deployed policy
     """
     entries = tuple(check_observation_space(observation_space).spaces)
@@ -119,7 +123,13 @@ def resolve_role_keys(
 
 
 def role_space(observation_space: spaces.Dict, keys: Sequence[str]) -> spaces.Dict:
-    """The part of the observation space that a role reads."""
+    """
+    The part of an observation space that a role reads.
+
+    :param observation_space: observation space of the environment
+    :param keys: names of the entries that the role reads
+    :return: space of these entries
+    """
     return spaces.Dict({key: observation_space.spaces[key] for key in keys})
 
 
@@ -127,11 +137,11 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
     """
     Hidden layer sizes per role.
 
-    :param roles: of the algorithm
-    :param net_arch: one list for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each policy and one
-        for "critic"
-    :return: role -> sizes, for all networks
-    :raises ValueError: if the names are of neither form, or a size is no integer above 0
+    :param roles: roles of the algorithm
+    :param net_arch: one list of sizes for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each policy and
+        one for "critic"
+    :return: role -> list of sizes, for all networks
+    :raises ValueError: if ``net_arch`` has none of these forms, or a size is no integer above 0
     """
     policies = roles.policies
     if isinstance(net_arch, list):
@@ -151,12 +161,12 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
 
 def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> dict[str, float]:
     """
-    Learning rates per role.
+    Multiples of the learning rate per role.
 
-    :param roles: of the algorithm
+    :param roles: roles of the algorithm
     :param lr_scales: role, or "critic" for all critics -> multiple of the learning rate, where it is not 1; and "memory" ->
         multiple of its network's rate, for the memory of every network that has one
-    :return: role -> multiple, for all roles, and that of memories
+    :return: role -> multiple, for all roles, and "memory" -> multiple for memories
     :raises ValueError: if a role is unknown or a multiple is not a number above 0
     """
     lr_scales = _check_roles("lr_scales", (*roles.all, MEMORY), lr_scales or {})
@@ -168,13 +178,14 @@ def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> di
 
 def resolve_update_every(roles: Roles, policy_delay: int, update_every: Mapping[str, int] | None) -> dict[str, int]:
     """
-    How often networks take a step.
+    Number of gradient steps for each step of a network, per role.
 
-    :param roles: of the algorithm
-    :param policy_delay: gradient steps to each step of a policy
-    :param update_every: role, or "critic" for all critics -> gradient steps to each of its own, where that differs
-    :return: role -> gradient steps, for all roles
-    :raises ValueError: if a role is unknown or a number is not a whole one above 0
+    :param roles: roles of the algorithm
+    :param policy_delay: number of gradient steps for each step of a policy's network
+    :param update_every: role, or "critic" for all critics -> number of gradient steps for each step of its network; by
+        default ``policy_delay`` for policies and 1 for all others
+    :return: role -> number of gradient steps, for all roles
+    :raises ValueError: if a role is unknown or a number is no integer above 0
     """
     given = _check_roles("update_every", roles.all, update_every or {})
     for role, every in given.items():
@@ -186,13 +197,13 @@ def resolve_rnn_types(
     roles: Roles, rnn_type: str | Mapping[str, str | None] | None, role_keys: Mapping[str, tuple[str, ...]]
 ) -> dict[str, str | None]:
     """
-    Which networks remember.
+    Type of memory per role.
 
-    :param roles: of the algorithm
-    :param rnn_type: "gru", "lstm" or ``None`` for all roles, or role, or "critic" for all critics -> one of them; and
-        "partial" -> that of every network that reads the entry ``partial`` alone and is not named otherwise
-    :param role_keys: role -> entries, for all networks
-    :return: role -> type, ``None`` for a network without a memory, for all networks
+    :param roles: roles of the algorithm
+    :param rnn_type: "gru", "lstm" or ``None`` for all roles; or role, or "critic" for all critics -> one of these, and
+        "partial" -> one of these for every network that reads the entry ``partial`` alone and is not named otherwise
+    :param role_keys: role -> entries that it reads, for all networks
+    :return: role -> type, or ``None`` for a network without a memory, for all networks
     :raises ValueError: if a role or a type is unknown
     """
     by_role = rnn_type if isinstance(rnn_type, Mapping) else dict.fromkeys(roles.networks, rnn_type)
@@ -208,10 +219,11 @@ def resolve_extractors(
     roles: Roles, extractor: type[BaseFeaturesExtractor] | Mapping[str, type[BaseFeaturesExtractor]]
 ) -> dict[str, type[BaseFeaturesExtractor]]:
     """
-    Encoders per role.
+    Class of the encoder per role.
 
-    :param roles: of the algorithm
-    :param extractor: one class for all roles, or role, or "critic" for all critics -> class, where it is not SB3's default
+    :param roles: roles of the algorithm
+    :param extractor: one class for all roles; or role, or "critic" for all critics -> class, where it is not
+        ``CombinedExtractor``, SB3's default
     :return: role -> class, for all networks
     :raises ValueError: if a role is unknown
     """
@@ -230,6 +242,6 @@ def _check_roles(name: str, roles: Sequence[str], given: Mapping[str, T]) -> Map
 
 
 def _for_each_role(roles: Roles, values: Mapping[str, T]) -> dict[str, T]:
-    """What is said of "critic" is said of every critic that is not named itself."""
+    """Values by role, where the value of "critic" is that of every critic that is not named itself."""
     of_critics = {role: values[CRITICS] for role in roles.critics if CRITICS in values}
     return of_critics | {role: value for role, value in values.items() if role in roles.all}

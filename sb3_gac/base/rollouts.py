@@ -1,4 +1,4 @@
-"""Collecting rollouts: every step that was taken is stored and none is invented, whoever stops, interrupts or interferes."""
+"""The loop that collects rollouts: it stores each step that was taken, and no other, whoever stops or interrupts it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
-#: Of a rollout buffer, what is filled step by step, besides observations
+#: Arrays of a rollout buffer that are filled step by step, besides observations
 _FILLED = ("actions", "rewards", "episode_starts", "values", "log_probs")
 
 
@@ -22,9 +22,9 @@ class UnrolledBuffer(DictRolloutBuffer):
     """
     SB3's buffer of rollouts, whose advantages may look ahead no further than the end of an unroll.
 
-    :param unroll_length: steps, after each of which an advantage bootstraps; ``None`` for the whole rollout
-    :param args: of ``DictRolloutBuffer``
-    :param kwargs: of ``DictRolloutBuffer``
+    :param unroll_length: number of steps in an unroll, at whose end advantages bootstrap; ``None`` for the whole rollout
+    :param args: positional arguments of ``DictRolloutBuffer``
+    :param kwargs: keyword arguments of ``DictRolloutBuffer``
     """
 
     def __init__(self, *args: Any, unroll_length: int | None = None, **kwargs: Any):
@@ -33,10 +33,10 @@ class UnrolledBuffer(DictRolloutBuffer):
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
         """
-        Generalised advantage estimation; it is cut where an episode ends and where an unroll ends.
+        Generalised advantage estimation, which is cut where an episode ends and where an unroll ends.
 
-        :param last_values: of the observations behind the last step, shape (n_envs,)
-        :param dones: whether an episode ended with the last step, shape (n_envs,)
+        :param last_values: values of the observations after the last step, shape (n_envs,)
+        :param dones: booleans, true where the last step ended an episode, shape (n_envs,)
         """
         next_values = np.concatenate([self.values[1:], last_values.detach().cpu().numpy().reshape(1, -1)])
         goes_on = 1.0 - np.concatenate([self.episode_starts[1:], np.asarray(dones, dtype=np.float32).reshape(1, -1)])
@@ -52,13 +52,15 @@ class UnrolledBuffer(DictRolloutBuffer):
 
 class RolloutCollection(OnPolicyAlgorithm):
     """
-    SB3's loop in another order: a step is stored before callbacks see it, and a rollout that was ended by one is gone on
-    with by the next ``learn(..., reset_num_timesteps=False)``: together they do what one would have done.
+    SB3's loop in another order: a step is stored before callbacks see it.
+
+    If a callback ends a rollout, the next ``learn(..., reset_num_timesteps=False)`` goes on with the rollout: the two calls
+    together do what a single one would have done.
     """
 
     #: Attributes that collecting changes
     collected = ("_obs_after_last_step",)
-    #: What followed the last step that was stored, if its episode may still bootstrap from it
+    #: Observations after the last stored step, from which its episodes may still bootstrap; ``None`` if there are none
     _obs_after_last_step: dict[str, np.ndarray] | None = None
     reward_scale: float
     unroll_length: int | None
@@ -69,17 +71,17 @@ class RolloutCollection(OnPolicyAlgorithm):
     call_hooks: Callable[[np.ndarray], None]
 
     def _setup_model(self) -> None:
-        """As SB3's, which would hand ``use_sde`` to the policy."""
+        """See SB3's ``_setup_model``; the policy is made without SB3's argument ``use_sde``."""
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         self._make_rollout_buffer()
         self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)  # type: ignore
         self.policy = self.policy.to(self.device)
 
-    # --- what others ask of the data ----------------------------------------------------------------------------------
+    # --- data ---------------------------------------------------------------------------------------------------------
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """See SB3's ``set_env``; the number of environments may be another one, between two rollouts."""
+        """See SB3's ``set_env``; between two rollouts, the number of environments may change."""
         assert isinstance(env, VecEnv)
         if env.num_envs != self.n_envs:
             self.n_envs, self._last_obs, self._obs_after_last_step = env.num_envs, None, None
@@ -87,7 +89,7 @@ class RolloutCollection(OnPolicyAlgorithm):
         super().set_env(env, force_reset)
 
     def cut_episodes(self) -> None:
-        """The environments are about to be reset: the last step of the rollout under way bootstraps, as at a time limit."""
+        """End the episodes under way before a reset: the last step of the rollout bootstraps, as at a time limit."""
         buffer = self.rollout_buffer
         if self._obs_after_last_step is not None and buffer.pos > 0 and not buffer.generator_ready:
             going_on = ~np.asarray(self._last_episode_starts)
@@ -95,10 +97,16 @@ class RolloutCollection(OnPolicyAlgorithm):
         self._obs_after_last_step = None
 
     def keep_first_observations(self) -> None:
-        """The environments were just reset."""
+        """Called after a reset of the environments; a rollout buffer needs nothing then."""
 
     def save_data(self, root: Path) -> tuple[dict[str, Any], list[str]]:
-        """The rollout under way, as far as it goes; of one that was trained on, nothing."""
+        """
+        The rollout under way, for a checkpoint.
+
+        :param root: folder of all checkpoints of a run
+        :return: filled part of each array of the rollout buffer by name (empty if the rollout was trained on already), and no
+            names of blocks
+        """
         buffer = self.rollout_buffer
         if buffer.generator_ready:
             return {}, []
@@ -106,7 +114,12 @@ class RolloutCollection(OnPolicyAlgorithm):
         return {**filled, "observations": {key: entry[: buffer.pos] for key, entry in buffer.observations.items()}}, []
 
     def restore_data(self, root: Path, saved: dict[str, Any]) -> None:
-        """The rollout under way, as it was."""
+        """
+        Restore the rollout under way.
+
+        :param root: folder of all checkpoints of a run
+        :param saved: first value that :meth:`save_data` returned
+        """
         if not saved:
             return
         buffer = self.rollout_buffer
@@ -118,7 +131,7 @@ class RolloutCollection(OnPolicyAlgorithm):
             buffer.observations[key][: buffer.pos] = entry
 
     def example_of_data(self) -> dict[str, th.Tensor]:
-        """A batch of observation entries and rewards as the networks see them, for the diagnosis of a divergence."""
+        """Observation entries and rewards of the rollout, as the networks see them, for the diagnosis of a divergence."""
         buffer = self.rollout_buffer
         entries = {**buffer.observations, "reward": buffer.rewards}
         return {name: th.as_tensor(values[: buffer.buffer_size]) for name, values in entries.items()}
@@ -147,12 +160,12 @@ class RolloutCollection(OnPolicyAlgorithm):
     ) -> bool:
         """See SB3's ``collect_rollouts``; callbacks find the same names in ``locals``."""
         self.policy.set_training_mode(False)
-        if self.rollout_buffer.generator_ready:  # it has been trained on
+        if self.rollout_buffer.generator_ready:  # gradient steps have been taken on the rollout
             self.rollout_buffer.reset()
         callback.on_rollout_start()
         dones = np.asarray(self._last_episode_starts)
         while self.rollout_buffer.pos < n_rollout_steps:
-            env, rollout_buffer = self.env, self.rollout_buffer  # type: ignore[assignment]  # a callback may set others
+            env, rollout_buffer = self.env, self.rollout_buffer  # type: ignore[assignment]  # a callback may set other environments
             self.reset_if_used_elsewhere(env)
             drawn, actions, values, log_probs = self._act()
             new_obs, rewards, dones, infos = env.step(actions)
@@ -177,10 +190,10 @@ class RolloutCollection(OnPolicyAlgorithm):
     @th.no_grad()
     def _act(self) -> tuple[np.ndarray, np.ndarray, th.Tensor, th.Tensor]:
         """
-        The behaviour policy's.
+        Let the behaviour policy act.
 
-        :return: what was drawn of its distribution, for the buffer; actions for the environments; values and
-            log-probabilities
+        :return: draws from its distribution, for the rollout buffer; actions for the environments; values of the
+            observations; log-probabilities of the draws
         """
         obs, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
         distribution = self.policy.behaviour_distribution(obs)  # type: ignore[operator]
@@ -192,10 +205,12 @@ class RolloutCollection(OnPolicyAlgorithm):
 
     def _with_value_of_what_was_cut(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """
-        :param rewards: shape (n_envs,)
-        :param dones: shape (n_envs,)
-        :param infos: of the environments
-        :return: with the discounted value of the last observation, where a time limit has ended an episode
+        Bootstrap where a time limit has ended an episode.
+
+        :param rewards: rewards of the step, shape (n_envs,)
+        :param dones: booleans, true where an episode has ended, shape (n_envs,)
+        :param infos: info dict of each environment
+        :return: rewards, plus the discounted value of the last observation where an episode was truncated, shape (n_envs,)
         """
         cut = [index for index in np.flatnonzero(dones).tolist() if infos[index].get("TimeLimit.truncated", False)]
         if cut:
@@ -206,8 +221,8 @@ class RolloutCollection(OnPolicyAlgorithm):
     @th.no_grad()
     def _values_of(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """
-        :param observation: B of each entry
-        :return: shape (B,)
+        :param observation: observations, each entry of shape (B, ...)
+        :return: values by the critic, shape (B,)
         """
         obs, _ = self.policy.obs_to_tensor(observation)
         return self.policy.critic(obs).cpu().numpy()  # type: ignore[operator]
@@ -221,6 +236,6 @@ class RolloutCollection(OnPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """See SB3's ``OnPolicyAlgorithm.learn``; TensorBoard's runs are named after the class by default."""
+        """See SB3's ``OnPolicyAlgorithm.learn``; by default TensorBoard's runs have the name of the class."""
         tb_log_name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

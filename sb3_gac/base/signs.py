@@ -1,4 +1,4 @@
-"""Whether a guider adds nothing to its learner, or too much: what training shows of it, and the setting to change."""
+"""Signs in training that a guider adds nothing to its learner, or does too much, and warnings with the setting to change."""
 
 import math
 import warnings
@@ -12,17 +12,17 @@ import torch as th
 from sb3_gac.base.batch import Batch
 from sb3_gac.base.comparing import ReturnComparison
 
-#: Episodes of each policy that make a block; blocks share none, so that chance does not carry over from one to the next
+#: Episodes of each policy in a block; blocks share none, so that chance does not carry over from one to the next
 BLOCK = 40
-#: Blocks in a row before a warning: chance alone makes a limit of 97.5% fail three times running once in 60,000
+#: Blocks in a row that lead to a warning: chance alone makes a limit of 97.5% fail three times running once in 60,000
 BLOCKS_IN_A_ROW = 3
-#: What a guider's episodes must return more than the learner's to count, in standard deviations of a policy's returns
+#: Smallest difference between the returns of guider and learner that counts, in standard deviations of a policy's returns
 SMALL_EFFECT = 0.5
-#: What the guider must gain to count by the learner's critics, in standard deviations of Q over the states
+#: Smallest gain of the guider by the learner's critics that counts, in standard deviations of Q over the states
 SMALL_GAIN = 0.05
-#: KL as a multiple of its target below which the guider does not use its freedom, and above which it is not held
+#: KL, as a multiple of its target, below which the guider does not use its freedom, and above which KL is out of control
 LITTLE_KL, MUCH_KL = 0.1, 2.0
-#: Looks in a row before a warning by critics or KL, which change slowly
+#: Looks in a row that lead to a warning by critics or KL, which change slowly
 LOOKS_IN_A_ROW = 10
 QUANTILE = 1.96
 
@@ -31,9 +31,9 @@ def effect_bounds(first: Sequence[float], second: Sequence[float]) -> tuple[floa
     """
     The difference of two policies' mean returns, in standard deviations of a policy's returns.
 
-    :param first: returns of a policy's episodes, two at least
-    :param second: of the other one's
-    :return: the 95% interval of the first less the second, by Welch's standard error
+    :param first: returns of one policy's episodes, two at least
+    :param second: returns of the other policy's episodes, two at least
+    :return: lower and upper limit of the 95% interval of the first mean minus the second, by Welch's standard error
     """
     difference = float(np.mean(first) - np.mean(second))
     variances = [float(np.var(returns, ddof=1)) for returns in (first, second)]
@@ -47,13 +47,15 @@ def effect_bounds(first: Sequence[float], second: Sequence[float]) -> tuple[floa
 
 def gain_and_error(advantages: th.Tensor, horizon: float, scale: float) -> tuple[float, float]:
     """
-    What the guider returns more than the learner, by the performance difference lemma (Kakade & Langford 2002): the
-    advantages of its actions over the learner's, by critics of the learner, in states that the guider meets.
+    The difference between the returns of guider and learner, estimated from advantages.
 
-    :param advantages: Q(s, guider's action) - Q(s, learner's action) by N critics, shape (N, B)
-    :param horizon: steps that returns sum up, 1 / (1 - gamma)
-    :param scale: standard deviation of Q over the states, which, other than its mean, no constant in the reward moves
-    :return: the gain in units of the scale, and its standard error, of the states drawn and of critics that disagree
+    By the performance difference lemma (Kakade & Langford 2002) it is the advantage of the guider's actions over the
+    learner's by the learner's Q, in states that the guider meets, summed up over the horizon.
+
+    :param advantages: Q(s, guider's action) - Q(s, learner's action) by N critics in B states, shape (N, B)
+    :param horizon: number of steps that returns sum up, 1 / (1 - gamma)
+    :param scale: standard deviation of Q over the states; unlike the mean of Q, it does not depend on a constant in the reward
+    :return: gain in units of the scale, and its standard error, from the states drawn and the critics' disagreement
     """
     n_critics, n_states = advantages.shape
     over_states = advantages.mean(dim=0).var(unbiased=False) / n_states
@@ -66,30 +68,33 @@ class GuidanceSigns(ReturnComparison):
     """
     Looks at the guider every ``compare_every`` environment steps, and whenever both policies have ended a block of episodes.
 
-    An absent gain is no more than a lack of data unless what is left of it is small: a guider adds nothing where the upper
-    95% limit of its advantage is below a small one, and too much where the lower limit of it is above nought, or KL is far
-    above its target. Each warning is given once in a training. Looking changes no random number, and no network.
+    A gain that can't be told from zero may be due to a lack of data. The guider therefore adds nothing only if the upper 95%
+    limit of its advantage is below a small one. It does too much if the lower limit of its advantage in returns is above
+    zero, or if KL is far above its target. Each warning is given once in a training. Looking changes neither random numbers
+    nor networks.
     """
 
     batch_size: int
     gamma: float
     _last_metrics: Mapping[str, float]
     _sample_batch: Callable[[int], Batch]
-    #: Cause -> what happened, with places for numbers, and which setting to change
+    #: Cause -> message that says what happened, with places for numbers, and which setting to change
     remedies: ClassVar[Mapping[str, str]]
-    #: Role of a policy -> returns of the episodes of the block under way
+    #: Role of a policy -> returns of its episodes in the block under way
     block: dict[str, list[float]]
-    #: Cause -> blocks or looks in a row that showed it
+    #: Cause -> number of latest blocks or looks in a row that showed it
     signs_in_a_row: dict[str, int]
-    #: Causes that were warned of
+    #: Causes of the warnings that were given
     signs_told: list[str]
 
     def start_comparing(self, first: str, second: str, compare_every: int, window: int) -> None:
         """
+        Begin to look at a guider and its learner.
+
         :param first: role of the guider
         :param second: role of the learner
-        :param compare_every: environment steps between two looks
-        :param window: see :class:`ReturnComparison`
+        :param compare_every: number of environment steps between two looks
+        :param window: number of latest episodes of each policy whose returns are compared, see :class:`ReturnComparison`
         """
         super().start_comparing(first, second, compare_every, window)
         self.block, self.signs_in_a_row, self.signs_told = {first: [], second: []}, {}, []
@@ -119,9 +124,9 @@ class GuidanceSigns(ReturnComparison):
     @th.no_grad()
     def guider_gain(self) -> tuple[float, float]:
         """
-        What the guider's actions gain over the learner's by critics of the learner, each policy without its exploration.
+        The gain of the guider's actions over the learner's by the learner's critics, each policy without exploration.
 
-        :return: see :func:`gain_and_error`
+        :return: gain and its standard error, see :func:`gain_and_error`
         """
         with random_numbers_kept(self.device):
             batch = self._sample_batch(self.batch_size)
@@ -133,7 +138,7 @@ class GuidanceSigns(ReturnComparison):
         )
 
     def _values(self, batch: Batch, policy: Any) -> th.Tensor:
-        """Of a policy's actions in the states that count, shape (N, B); of discrete ones by the smaller critic, (1, B)."""
+        """Values of a policy's actions in the states that count, shape (N, B); (1, B), by the smallest critic, if discrete."""
         no_noise = th.zeros(batch.actions.shape, device=self.device)
         values, _ = policy.value_and_log_prob(batch.q_at_obs(self.policy.critic), no_noise)
         return values[:, batch.mask > 0] if batch.mask is not None else values
@@ -164,10 +169,12 @@ class GuidanceSigns(ReturnComparison):
 
     def _judge(self, cause: str, is_so: bool, patience: int, numbers: Mapping[str, Any]) -> None:
         """
+        Count a block or look that shows a cause, or begin anew, and warn when enough have come in a row.
+
         :param cause: a key of :attr:`remedies`
-        :param is_so: whether this block or look shows it
-        :param patience: how many in a row make a warning
-        :param numbers: for its message
+        :param is_so: whether this block or look shows the cause
+        :param patience: number of blocks or looks in a row that lead to a warning
+        :param numbers: name -> number, for the places in the message
         """
         self.signs_in_a_row[cause] = self.signs_in_a_row.get(cause, 0) + 1 if is_so else 0
         if self.signs_in_a_row[cause] >= patience and cause not in self.signs_told:
@@ -178,9 +185,9 @@ class GuidanceSigns(ReturnComparison):
 @contextmanager
 def random_numbers_kept(device: th.device) -> Iterator[None]:
     """
-    Afterwards numpy's and torch's generators go on from where they were.
+    Keep numpy's and torch's random numbers as if none were drawn within the context.
 
-    :param device: of the networks
+    :param device: device of the networks, whose generator is kept as well
     """
     state = np.random.get_state()
     with th.random.fork_rng(devices=[th.cuda.current_device()] if device.type == "cuda" else []):

@@ -13,17 +13,18 @@ class DeploymentGuard(BaseAlgorithm):
     """
     ``predict`` of an algorithm whose deployed policy reads only some of the observation's entries.
 
-    It ignores all others, so that evaluation may pass it full observations.  With ``strict_deployment`` it refuses them::
+    By default ``predict`` ignores all other entries, so that evaluations may pass it full observations.  With
+    ``strict_deployment`` it refuses them::
 
         model = GAC.load("cheetah", strict_deployment=True)
 
-    The attribute may be set at any time and is saved with the model.  Evaluations during training pass full observations:
-    set it afterwards.
+    The attribute may be set at any time and is saved with the model.  Evaluations during training pass full observations, so
+    set the attribute after training.
     """
 
     policy: AsymmetricPolicy
     strict_deployment: bool = False
-    #: Whether it learned from observations that ``VecNormalize`` normalised: without these statistics there is no deployment
+    #: Whether the model learned from observations that ``VecNormalize`` normalised, whose statistics deployment then needs
     trained_normalised: bool = False
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
@@ -41,12 +42,13 @@ class DeploymentGuard(BaseAlgorithm):
         """
         The deployed policy's action.
 
-        :param observation: single or batched; a dict, or, where the policy reads one entry, that entry alone
-        :param state: what a recurrent policy's last call returned, ``None`` at the start
-        :param episode_start: true where an episode starts, shape (B,)
-        :param deterministic: mode instead of a sample
+        :param observation: one observation or a batch: a dict, or the array of the one entry that the policy reads
+        :param state: state that the last call returned, for a recurrent policy; ``None`` at the start
+        :param episode_start: booleans, true where an episode starts, shape (B,)
+        :param deterministic: whether to take the distribution's mode instead of a sample
         :return: action in the environment's range, and the state for the next call
-        :raises ValueError: if an entry is missing; with ``strict_deployment``, if there is one that the policy does not read
+        :raises ValueError: if an entry is missing, or, with ``strict_deployment``, if there is one that the policy does not
+            read
         """
         if self.strict_deployment and isinstance(observation, Mapping):
             self._refuse_unread(observation)

@@ -1,4 +1,4 @@
-"""What a gradient step is put together from: the one primitive ``minimize``, programs, and what is logged."""
+"""The parts of a gradient step: the primitive ``minimize``, compiled programs, and the logging of metrics."""
 
 from abc import abstractmethod
 from collections import Counter
@@ -23,10 +23,10 @@ from sb3_gac.optim.parallel import Worker, worker
 
 class _Step(NamedTuple):
     """
-    A step that waits for :meth:`GradientSteps.joined`.
+    A step of an optimiser that waits for :meth:`GradientSteps.joined`.
 
-    :param take: what takes it
-    :param metrics: filled when it has been taken
+    :param take: function that takes the step and returns its metrics
+    :param metrics: dict that gets the metrics once the step has been taken
     """
 
     take: Callable[[], Metrics]
@@ -35,9 +35,10 @@ class _Step(NamedTuple):
 
 def _scheduled(minimize: Callable[..., Metrics]) -> Callable[..., Metrics]:
     """
-    Where there is a worker, steps wait for :meth:`GradientSteps.joined`, and so do their metrics.
+    Have the steps of ``minimize`` wait for :meth:`GradientSteps.joined`, where there is a worker.
 
-    :param minimize: see :meth:`GradientSteps.minimize`
+    :param minimize: the function :meth:`GradientSteps.minimize`
+    :return: function that takes the step at once without a worker, and otherwise returns a dict that gets the metrics later
     """
 
     @wraps(minimize)
@@ -55,48 +56,48 @@ class GradientSteps(BaseAlgorithm):
     """
     Gradient steps of a policy's networks and coefficients: an algorithm writes one ``update``, made of ``minimize``.
 
-    What changes from step to step must be a tensor: an argument of a loss, a parameter or a coefficient's value. Numbers that
-    a loss finds on ``self`` are named in ``compiled_settings``. The attributes below are those of
+    Whatever changes from step to step must be a tensor: an argument of a loss, a parameter or a coefficient's value. Numbers
+    that a loss finds on ``self`` are named in ``compiled_settings``. The attributes below are those of
     :class:`sb3_gac.base.algorithm.AsymmetricAlgorithm`.
     """
 
-    #: Arguments that a compiled update takes for constants: a change compiles it anew
+    #: Arguments that are constants of a compiled update, which is compiled anew when one of them changes
     compiled_settings: ClassVar[tuple[str, ...]] = ("max_grad_norm", "mixed_precision")
     policy: AsymmetricPolicy
     coefficients: dict[str, Coefficient]
     max_grad_norm: float | None
     mixed_precision: bool
     programs: dict[Any, Program]
-    #: What :class:`sb3_gac.base.compiling.Compilation` has decided
+    #: The argument ``compile``, and what :class:`sb3_gac.base.compiling.Compilation` has decided
     compile: bool | str
     compiles: bool
     _compiles_on_auto: bool
     _failed_to_compile: bool
     _compiling_failed: Callable[[Exception], None]
     _branches_are_independent: bool
-    #: Takes the steps of :attr:`AsymmetricPolicy.side_branch`, in a round in which branches run at once
+    #: Thread that takes the steps of :attr:`AsymmetricPolicy.side_branch`, in a round in which branches run at once
     _worker: Worker | None = None
-    #: Whether beside -> steps that wait for :meth:`joined`, during such a round
+    #: Whether steps are the side branch's -> steps that wait for :meth:`joined`, during such a round
     _branches: dict[bool, list[_Step]]
     _program_key: tuple[Any, ...] = ()
     #: Networks that the gradient step under way leaves as they are, see ``update_every``
     _resting: frozenset[str] = frozenset()
-    #: Of the last round of gradient steps, all finite
+    #: Metrics of the last round of gradient steps, all finite
     _last_metrics: Mapping[str, float] = MappingProxyType({})
 
-    # --- what an algorithm writes, and what it writes it with ---------------------------------------------------------
+    # --- what an algorithm's update is made of ------------------------------------------------------------------------
 
     @_scheduled
     def minimize(self, networks: str | tuple[str, ...], loss: Callable[..., Loss], *tensors: Any) -> Metrics:
         """
         One step of a network's optimiser down a loss, for which all other networks are constants.
 
-        :param networks: name of one, or of several that share a loss, each with its own optimiser; the gradient by all of
-            them is scaled to a norm of at most ``max_grad_norm``
-        :param loss: function of the tensors
-        :param tensors: in tuples or dicts; what changes from step to step
-        :return: the loss under the (first) network's name, the norms of the gradients, and the loss's metrics; nothing of a
-            network that an ablation does without
+        :param networks: name of a network, or names of several that share a loss, each with its own optimiser; the gradient
+            with respect to all of them is scaled to a norm of at most ``max_grad_norm``
+        :param loss: function of ``tensors`` that returns the loss and its metrics
+        :param tensors: arguments of the loss, also in tuples or dicts: all that changes from step to step
+        :return: name -> metric: the loss under the (first) network's name, the norm of each network's gradient, and the
+            loss's metrics; empty for a network that an ablation does without
         """
         names = (networks,) if isinstance(networks, str) else networks
         if not self.policy.has(names[0]):
@@ -118,10 +119,10 @@ class GradientSteps(BaseAlgorithm):
 
     def joined(self, *steps: Metrics) -> Metrics:
         """
-        Where there is a worker, it takes the steps of the side branch while this thread takes the others.
+        Finish steps that wait: a worker takes those of the side branch while this thread takes the others.
 
-        :param steps: what :meth:`minimize` has returned
-        :return: all of it, when all is done
+        :param steps: dicts that :meth:`minimize` has returned
+        :return: metrics of all these steps, name -> metric, once all have been taken
         """
         if self._worker is not None:
             beside, here = self._branches[True], self._branches[False]
@@ -135,8 +136,9 @@ class GradientSteps(BaseAlgorithm):
         """
         Forward passes of policies, before any network is changed.
 
-        :param batch: of transitions
+        :param batch: batch of transitions
         :param roles: names of the policies
+        :return: outputs of the policies' networks for the batch, in the order of ``roles``
         """
         found: dict[str, Outputs] = {}
 
@@ -155,17 +157,19 @@ class GradientSteps(BaseAlgorithm):
 
     def bellman_loss(self, name: str, batch: Batch, target: th.Tensor) -> Loss:
         r"""
-        :param name: of the critics
-        :param batch: of transitions
+        The loss of critics.
+
+        :param name: name of the critics' network
+        :param batch: batch of transitions
         :param target: Bellman target, shape (\*E)
-        :return: squared Bellman residual, with the mean Q
+        :return: squared Bellman residual, with the mean Q as its metric
         """
         q = getattr(self.policy, name)(batch.observations, batch.actions)
         loss = critic_loss(q, target, batch.mask, batch.critic_weights)
         return Loss(loss, {f"{name}_q": masked_mean(q.detach().mean(dim=0), batch.mask)})
 
     def coefficient_values(self) -> Metrics:
-        """To be logged: name -> value, the mean over dimensions where there are several."""
+        """Metrics of the coefficients: name -> value, its mean if there is one for each action dimension."""
         return {name: coefficient.value.mean() for name, coefficient in self.coefficients.items()}
 
     # --- a round of steps ---------------------------------------------------------------------------------------------
@@ -173,9 +177,9 @@ class GradientSteps(BaseAlgorithm):
     @contextmanager
     def gradient_steps_under_way(self) -> Iterator[list[Metrics]]:
         """
-        A round of gradient steps: networks in training mode, learning rates and schedules as they are by now.
+        The context of a round of gradient steps: networks in training mode, present learning rates and schedules.
 
-        :return: list for the metrics of each step, whose means are logged at the end
+        :return: context, whose value is a list for the metrics of each step; their means are logged at the end
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._scheduled_optimizers())
@@ -197,10 +201,12 @@ class GradientSteps(BaseAlgorithm):
 
     def _compiled(self, name: Any, function: Callable[..., Any], *args: Any) -> Any:
         """
-        :param name: of the function
-        :param function: of tensors, and of what the key says of this object
-        :param args: its arguments
-        :return: its value, by a program of its own for all that the key says
+        Call a function by its compiled program, of which there is one for each combination of all that it depends on.
+
+        :param name: name of the function
+        :param function: function of tensors, which may also depend on those attributes of this object that are in the key
+        :param args: arguments of the function
+        :return: value of the function
         """
         key = (name, self._resting, *self._program_key, *_layout(args))
         if key not in self.programs:
@@ -214,7 +220,7 @@ class GradientSteps(BaseAlgorithm):
         return nullcontext()
 
     def refresh_schedules(self) -> None:
-        """Before a round of gradient steps: put in tensors what schedules say now."""
+        """Put the present values of schedules into tensors, before a round of gradient steps."""
         for coefficient in self.coefficients.values():
             coefficient.refresh(self.compiles)
 
@@ -223,7 +229,11 @@ class GradientSteps(BaseAlgorithm):
         """Optimisers that follow ``learning_rate``."""
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        """Follow the schedule; a parameter group's "lr_scale" multiplies it."""
+        """
+        Set learning rates to the schedule's present value, times the "lr_scale" of a parameter group.
+
+        :param optimizers: optimisers whose learning rates are set
+        """
         super()._update_learning_rate(optimizers)
         for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
             for group in optimizer.param_groups:
@@ -231,9 +241,9 @@ class GradientSteps(BaseAlgorithm):
 
     def _record_metrics(self, history: list[Metrics]) -> None:
         """
-        Log means over the gradient steps of one ``train()``: the only host transfer.
+        Log means over the gradient steps of one ``train()``, which takes the only transfer from the device to the host.
 
-        :param history: of each gradient step
+        :param history: metrics of each gradient step
         :raises DivergenceError: if a metric is not finite
         """
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -243,7 +253,7 @@ class GradientSteps(BaseAlgorithm):
         nothing = th.zeros((), device=self.device)
         sums = th.stack([th.stack([step.get(name, nothing) for name in counts]) for step in history]).sum(dim=0).tolist()
         values = {name: total / count for (name, count), total in zip(counts.items(), sums, strict=True)}
-        if (of_deployed := f"{self.policy.roles.deployed}_loss") in values:  # SB3's names for the two
+        if (of_deployed := f"{self.policy.roles.deployed}_loss") in values:  # under SB3's names as well
             values["actor_loss"] = values[of_deployed]
         if of_critics := [value for name, value in values.items() if name.endswith("critic_loss")]:
             values["critic_loss"] = sum(of_critics)
@@ -255,7 +265,7 @@ class GradientSteps(BaseAlgorithm):
 
 
 def _take(steps: Sequence[_Step]) -> None:
-    """One after the other."""
+    """Take steps one after the other."""
     for step in steps:
         step.metrics.update(step.take())
 
@@ -268,14 +278,18 @@ def _split(gradients: Sequence[th.Tensor], counts: Sequence[int]) -> Iterator[Se
 
 def scale_of(norms: Sequence[th.Tensor], max_norm: float | None) -> th.Tensor | None:
     """
-    :param norms: of parts of a gradient
-    :param max_norm: what the norm of all is to be at most; ``None`` for no bound
-    :return: what the gradient is to be multiplied with, as torch's ``clip_grad_norm_`` has it
+    The factor that clips a gradient.
+
+    :param norms: norms of the parts of the gradient, scalars
+    :param max_norm: bound on the norm of the whole gradient; ``None`` for no bound
+    :return: factor for the gradient, as in torch's ``clip_grad_norm_``; ``None`` where the gradient stays as it is
     """
     if max_norm is None or not norms:
         return None
     norm = norms[0] if len(norms) == 1 else th.linalg.vector_norm(th.stack(list(norms)))
-    return (max_norm / (norm + 1e-6)).clamp(max=1.0)
+    scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
+    # A comparison needs no transfer on the CPU, and saves a pass over all gradients where nothing is clipped
+    return None if scale.device.type == "cpu" and not th.compiler.is_compiling() and scale == 1 else scale
 
 
 def _layout(value: Any) -> Iterator[Any]:

@@ -1,1 +1,1 @@
-"""State as files, whole or not at all, and back; it knows of no algorithm."""
+"""State written to files, whole or not at all, and read back, for any algorithm."""

@@ -1,15 +1,15 @@
 """
-Checkpoints on disk: each a directory that is there whole or not at all, every file with its checksum, the last few kept.
+Checkpoints on disk: each is a folder that is there whole or not at all, with a checksum of every file. The latest are kept.
 
 ::
 
-    <root>/checkpoint-000007-step-000000050000/manifest.json   names, sizes and checksums of all that belongs to it
-    <root>/checkpoint-000007-step-000000050000/...             what changes from one checkpoint to the next
-    <root>/blocks/<checksum>                                   what they share: parts of the replay buffer
+    <root>/checkpoint-000007-step-000000050000/manifest.json   names, sizes and checksums of the checkpoint's files
+    <root>/checkpoint-000007-step-000000050000/...             files that change from one checkpoint to the next
+    <root>/blocks/<checksum>                                   blocks, parts of the replay buffer that checkpoints share
 
-The latest one is the one that was written last, whatever its step: training may have been resumed from before a checkpoint
-that turned out to be damaged.  A block is written once, whatever number of checkpoints it belongs to, and goes with the last
-of them.
+The latest checkpoint is the one that was written last, whatever its step: training may have been resumed from a checkpoint
+before one that turned out to be damaged.  A block is written once, however many checkpoints it belongs to, and is removed
+with the last of them.
 """
 
 import hashlib
@@ -26,18 +26,25 @@ _PREFIX, _TEMPORARY, _BLOCKS, _MANIFEST = "checkpoint-", ".writing", "blocks", "
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that is incomplete or altered, or none where there should be one."""
+    """A checkpoint is incomplete, altered or missing."""
 
 
 def checksum(content: bytes) -> str:
-    """SHA-256, in hexadecimal digits."""
+    """
+    The SHA-256 checksum of bytes.
+
+    :param content: bytes
+    :return: checksum in hexadecimal digits
+    """
     return hashlib.sha256(content).hexdigest()
 
 
 def write_durably(path: Path, content: bytes) -> None:
     """
-    :param path: of a new file, which is on the disk when this returns
-    :param content: of it
+    Write a file, and return once it is on the disk.
+
+    :param path: path of the file
+    :param content: content of the file
     """
     with path.open("wb") as file:
         file.write(content)
@@ -47,7 +54,9 @@ def write_durably(path: Path, content: bytes) -> None:
 
 def sync_directory(path: Path) -> None:
     """
-    :param path: whose entries are on the disk when this returns
+    Return once the entries of a folder are on the disk.
+
+    :param path: path of the folder
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -58,9 +67,11 @@ def sync_directory(path: Path) -> None:
 
 def write_block(root: Path, content: bytes) -> str:
     """
-    :param root: of the checkpoints
-    :param content: to be shared by checkpoints
-    :return: its name, which is its checksum
+    Write a block, unless it is there already.
+
+    :param root: folder of all checkpoints of a run
+    :param content: content of the block, which checkpoints may share
+    :return: name of the block, which is its checksum
     """
     name = checksum(content)
     path = root / _BLOCKS / name
@@ -74,29 +85,38 @@ def write_block(root: Path, content: bytes) -> str:
 
 def has_block(root: Path, name: str) -> bool:
     """
-    :param root: of the checkpoints
-    :param name: of :func:`write_block`
+    Whether a block is there.
+
+    :param root: folder of all checkpoints of a run
+    :param name: name of the block, from :func:`write_block`
     """
     return (root / _BLOCKS / name).exists()
 
 
 def read_block(root: Path, name: str) -> bytes:
     """
-    :param root: of the checkpoints
-    :param name: of :func:`write_block`
+    Read a block.
+
+    :param root: folder of all checkpoints of a run
+    :param name: name of the block, from :func:`write_block`
+    :return: content of the block
     """
     return (root / _BLOCKS / name).read_bytes()
 
 
 def write_checkpoint(root: Path, step: int, files: Mapping[str, bytes], blocks: Iterable[str], keep: int) -> Path:
     """
-    :param root: of the checkpoints
+    Write a checkpoint, and remove those that are no longer to be kept.
+
+    The checkpoint's folder appears once all its files are on the disk, and only then are earlier checkpoints removed.
+
+    :param root: folder of all checkpoints of a run
     :param step: number of environment steps
-    :param files: name -> content
-    :param blocks: names of :func:`write_block` that belong to it
-    :param keep: how many of the latest checkpoints stay
-    :return: the checkpoint's directory; before this returns it is not there, and the ones before it are
-    :raises OSError: if the disk is full; what was there before is as it was
+    :param files: name -> content of the checkpoint's files
+    :param blocks: names of the blocks that belong to the checkpoint, from :func:`write_block`
+    :param keep: number of checkpoints to keep, the latest ones
+    :return: folder of the checkpoint
+    :raises OSError: if the disk is full; earlier checkpoints are as they were
     """
     root.mkdir(parents=True, exist_ok=True)
     earlier = checkpoints(root)
@@ -124,15 +144,19 @@ def write_checkpoint(root: Path, step: int, files: Mapping[str, bytes], blocks: 
 
 def checkpoints(root: Path) -> list[Path]:
     """
-    :param root: of the checkpoints
-    :return: their directories, the one written last first
+    The checkpoints of a run, whole or not.
+
+    :param root: folder of all checkpoints of the run
+    :return: folders of the checkpoints, the one written last first
     """
     return sorted(root.glob(f"{_PREFIX}*"), reverse=True)
 
 
 def step_of(checkpoint: Path) -> int:
     """
-    :param checkpoint: one of :func:`checkpoints`
+    The step of a checkpoint.
+
+    :param checkpoint: folder of the checkpoint, one of :func:`checkpoints`
     :return: number of environment steps
     """
     return int(checkpoint.name.rpartition("-")[2])
@@ -155,7 +179,9 @@ def _prune(root: Path, keep: int) -> None:
 
 def _manifest(directory: Path) -> dict[str, Any]:
     """
-    :raises CheckpointError: naming what is wrong
+    :param directory: folder of one checkpoint
+    :return: content of the checkpoint's manifest
+    :raises CheckpointError: naming what is wrong with it
     """
     path = directory / _MANIFEST
     try:
@@ -173,8 +199,10 @@ def _manifest(directory: Path) -> dict[str, Any]:
 
 def read_checkpoint(directory: Path) -> tuple[dict[str, bytes], list[str]]:
     """
-    :param directory: of one checkpoint
-    :return: its files, name -> content, and the names of its blocks; all of them are as they were written
+    Read a checkpoint and compare all its files and blocks with their checksums.
+
+    :param directory: folder of the checkpoint
+    :return: name -> content of its files, and the names of its blocks
     :raises CheckpointError: naming the file that is missing, incomplete or altered
     """
     manifest = _manifest(directory)
@@ -196,9 +224,11 @@ def _checked(path: Path, expected: str) -> bytes:
 
 def latest_whole(root: Path) -> tuple[Path, dict[str, bytes]]:
     """
-    :param root: of the checkpoints
-    :return: directory and files of the latest one that is as it was written; a warning names those that are not
-    :raises CheckpointError: if there is none
+    The latest checkpoint that is as it was written; a warning names later ones that are not.
+
+    :param root: folder of all checkpoints of a run
+    :return: folder of the checkpoint, and name -> content of its files
+    :raises CheckpointError: if there is no such checkpoint
     """
     refused = []
     for directory in checkpoints(root):

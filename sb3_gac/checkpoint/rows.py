@@ -1,4 +1,4 @@
-"""Rows of a replay buffer in blocks, each a file, of which only those that have changed are written again."""
+"""Rows of a replay buffer written in blocks, each a file; only blocks that have changed are written again."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,23 +16,23 @@ class Ring(Protocol):
 
     @property
     def n_added(self) -> int:
-        """Rows added so far."""
+        """Number of rows added so far."""
 
     @property
     def n_rows(self) -> int:
-        """Rows that it holds when it is full."""
+        """Number of rows that the buffer holds when it is full."""
 
     def rows_by_name(self) -> Mapping[str, np.ndarray]:
-        """What each row consists of, (n_rows, ...) each."""
+        """Name -> array of shape (n_rows, ...), for all that a row consists of."""
 
 
 class SavedBlocks(NamedTuple):
     """
-    What a buffer's rows were when they were last written.
+    The blocks of a buffer's rows that were written last.
 
-    :param root: of the checkpoints
-    :param n_added: rows added by then
-    :param names: of the blocks, in the order of the rows
+    :param root: folder of all checkpoints of a run
+    :param n_added: number of rows that had been added to the buffer by then
+    :param names: names of the blocks, in the order of the rows
     """
 
     root: Path
@@ -42,12 +42,13 @@ class SavedBlocks(NamedTuple):
 
 def write_rows(buffer: Ring, root: Path, before: SavedBlocks | None) -> SavedBlocks:
     """
-    Write the blocks of rows that have changed since they were last written there.
+    Write the blocks of rows that have changed since they were last written to the same folder.
 
-    :param buffer: whose rows they are
-    :param root: of the checkpoints
-    :param before: what was written last, wherever that was
-    :raises OSError: if they can't be written
+    :param buffer: buffer whose rows are written
+    :param root: folder of all checkpoints of a run
+    :param before: blocks that were written last, to this folder or another; ``None`` if none were
+    :return: blocks of all rows, as they are now
+    :raises OSError: if the blocks can't be written
     """
     arrays, n_rows = buffer.rows_by_name(), buffer.n_rows
     per_block = _rows_per_block(arrays)
@@ -56,7 +57,7 @@ def write_rows(buffer: Ring, root: Path, before: SavedBlocks | None) -> SavedBlo
     changed = np.arange(len(names))
     if before is not None and before.root == root and buffer.n_added - before.n_added < n_rows - 2:
         names[: len(before.names)] = before.names
-        # The step before may have been cut, and the newest next observation stands where a step to come will be
+        # The step before may have been cut, and the newest next observation is in the row of the next step
         written = np.arange(max(before.n_added - 1, 0), buffer.n_added + 1) % n_rows // per_block
         changed = np.union1d(written, [block for block, name in enumerate(names) if not has_block(root, name)])
     for block in changed.astype(int).tolist():
@@ -69,9 +70,10 @@ def read_rows(buffer: Ring, root: Path, names: list[str]) -> SavedBlocks:
     """
     Put a buffer's rows back.
 
-    :param buffer: which counts as many rows as were written
-    :param root: of the checkpoints
-    :param names: of the blocks
+    :param buffer: buffer to fill, whose ``n_added`` is already that of the written buffer
+    :param root: folder of all checkpoints of a run
+    :param names: names of the blocks, in the order of the rows
+    :return: blocks of all rows, for the next call of :func:`write_rows`
     """
     arrays = buffer.rows_by_name()
     per_block, n_filled = _rows_per_block(arrays), min(buffer.n_added + 1, buffer.n_rows)

@@ -1,7 +1,7 @@
 """
-Values as JSON and arrays, and back, without ever executing what a file says.
+Values as JSON and arrays, and back, without ever executing the content of a file.
 
-Objects and classes are written down by name, and only those of the libraries in :data:`TRUSTED` are looked up again.
+Objects and classes are written by name, and only names in the libraries of :data:`TRUSTED` are looked up again.
 """
 
 import importlib
@@ -16,16 +16,18 @@ TRUSTED = ("sb3_gac", "stable_baselines3", "torch", "gymnasium", "numpy", "colle
 
 
 class UntrustedNameError(ValueError):
-    """A value, or a file, that names a class of a library that is not trusted."""
+    """A value or a file names a class of a library that is not trusted."""
 
 
 def encode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     """
-    :param value: of numbers, strings, lists, tuples, dicts with strings as keys, arrays, numpy generators, classes, and
-        objects of trusted classes
-    :param arrays: gets the arrays, by number
-    :return: what JSON can hold
-    :raises UntrustedNameError: naming the class of which there is something else
+    Convert a value to a form that JSON can hold, with arrays apart.
+
+    :param value: value made of numbers, strings, lists, tuples, deques, dicts with strings as keys, arrays, numpy generators,
+        trusted classes and their objects
+    :param arrays: dict that gets the arrays of the value, by number
+    :return: value in a form that JSON can hold
+    :raises UntrustedNameError: naming the class of a part that is none of these
     """
     if isinstance(value, np.generic):
         return encode(np.asarray(value), arrays) | {"scalar": True}
@@ -49,10 +51,12 @@ def encode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
 
 def decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """
-    :param value: of :func:`encode`
-    :param arrays: likewise
-    :return: what was encoded
-    :raises UntrustedNameError: if it names a class of another library
+    Convert an encoded value back.
+
+    :param value: value that :func:`encode` returned
+    :param arrays: arrays by number, which :func:`encode` has filled
+    :return: value that was encoded
+    :raises UntrustedNameError: if it names a class of a library that is not trusted
     """
     if not isinstance(value, dict):
         return value
@@ -80,9 +84,11 @@ def decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 def reference(kind: type) -> str:
     """
-    :param kind: a class of a trusted library
-    :return: its module and name
-    :raises UntrustedNameError: if it is of another one, or not to be found by its name
+    The name under which a class is written.
+
+    :param kind: class of a trusted library
+    :return: module and qualified name, with a colon between them
+    :raises UntrustedNameError: if the library is not trusted, or the class is not found by that name
     """
     name = f"{kind.__module__}:{kind.__qualname__}"
     if dereference(name) is not kind:
@@ -92,9 +98,11 @@ def reference(kind: type) -> str:
 
 def dereference(name: str) -> Any:
     """
-    :param name: of :func:`reference`
-    :return: the class
-    :raises UntrustedNameError: if it is of a library that is not trusted, or no class
+    Find a class by name.
+
+    :param name: module and qualified name, from :func:`reference`
+    :return: class of that name
+    :raises UntrustedNameError: if the library is not trusted, or there is no class of that name
     """
     module, _, path = name.partition(":")
     if module.partition(".")[0] not in TRUSTED:

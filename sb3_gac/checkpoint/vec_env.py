@@ -1,4 +1,4 @@
-"""Vectorised environments: what has to be written down of them, so that another process goes on from there."""
+"""The state of vectorised environments, written down so that another process can go on from there."""
 
 from copy import deepcopy
 from typing import Any
@@ -17,9 +17,12 @@ CHANGING: dict[type, tuple[str, ...]] = {
 
 def vec_env_state(env: VecEnv) -> dict[str, Any]:
     """
-    :param env: between two steps
-    :return: "wrappers", of those that are known, outermost first, and "episodes", of each environment; where their
-        episodes can't be taken up again, that is ``None`` and "why" says why not
+    The state of vectorised environments.
+
+    :param env: vectorised environments, between two steps
+    :return: dict with "names" of all wrappers, outermost first; "wrappers", the changing attributes of each (none of an
+        unknown wrapper); "episodes", the state of each environment, or ``None`` if episodes can't be taken up again; and
+        "why", the reason for that, else empty
     """
     wrappers, inner = _unwrap(env)
     unknown = [type(wrapper).__name__ for wrapper in wrappers if type(wrapper) not in CHANGING]
@@ -39,9 +42,12 @@ def vec_env_state(env: VecEnv) -> dict[str, Any]:
 
 def restore_vec_env_state(env: VecEnv, state: dict[str, Any]) -> str:
     """
-    :param env: made like the one that the state is of
-    :param state: of :func:`vec_env_state`
-    :return: why the environments could not go on with their episodes; empty if they do
+    Restore the state of vectorised environments.
+
+    :param env: vectorised environments, made and wrapped like those that the state was taken from
+    :param state: state that :func:`vec_env_state` returned
+    :return: reason why the environments can't go on with their episodes; empty if they can
+    :raises NotRestorableError: if ``env`` has other wrappers
     """
     wrappers, inner = _unwrap(env)
     if [type(wrapper).__name__ for wrapper in wrappers] != state["names"]:
@@ -63,7 +69,9 @@ def restore_vec_env_state(env: VecEnv, state: dict[str, Any]) -> str:
 
 def _episodes(inner: Any) -> Any:
     """
-    :raises NotRestorableError: if they can't be taken up again
+    :param inner: vectorised environments without wrappers
+    :return: state of each environment's episode, or of the one simulator of them all
+    :raises NotRestorableError: if the episodes can't be taken up again
     """
     if hasattr(type(inner), "checkpoint_state"):  # one simulator of them all, see sb3_gac.envs.vector
         return {"simulator": inner.checkpoint_state()}
@@ -86,7 +94,7 @@ def _check_in_this_process(inner: Any) -> None:
 
 
 def _unwrap(env: VecEnv) -> tuple[list[VecEnvWrapper], Any]:
-    """Wrappers, outermost first, and what they are around."""
+    """The wrappers, outermost first, and the vectorised environments inside."""
     wrappers = []
     while isinstance(env, VecEnvWrapper):
         wrappers.append(env)

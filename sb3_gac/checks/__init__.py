@@ -1,1 +1,1 @@
-"""What users and environments hand in, looked at before it does harm; each error names the culprit and the remedy."""
+"""Checks of what users and environments hand in, before it does harm; each error names the culprit and the remedy."""

@@ -1,4 +1,4 @@
-"""Checks of constructor arguments, one table for each class; see :mod:`sb3_gac.checks.values`."""
+"""Checks of constructor arguments, in a table for each class; see :mod:`sb3_gac.checks.values`."""
 
 import inspect
 import os
@@ -29,17 +29,18 @@ ArgumentCheck: TypeAlias = Callable[..., None]
 """Takes an argument's name and its value; raises a ValueError that says what is allowed."""
 
 LARGEST_SEED = 2**32 - 1
-#: Argument -> SB3's attribute, where it is called otherwise
+#: Argument -> SB3's attribute for it, where the names differ
 KEPT_AS = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
-#: What is handed on to classes that may be the user's own, with all arrays that they may take
+#: Arguments that are handed on to classes that may be the user's own, so that arrays in them stay arrays
 HANDED_ON = ("policy_kwargs", "replay_buffer_kwargs")
 
 
 class PlainSchedule(FloatSchedule):
     """
-    A schedule of Python's numbers, whatever its function returns: numpy's, torch's, or arrays of one.
+    A schedule whose values are Python's numbers, even if its function returns numpy's or torch's, or arrays of one number.
 
-    :param value: a number, a function of the progress that remains, or the text of one, see :mod:`sb3_gac.schedules`
+    :param value: number, function of the fraction of training that remains, or text of a schedule, see
+        :mod:`sb3_gac.schedules`
     """
 
     def __init__(self, value: Any):
@@ -47,23 +48,30 @@ class PlainSchedule(FloatSchedule):
 
     def __call__(self, progress_remaining: float) -> float:
         """
-        :param progress_remaining: from 1 to 0
+        The schedule's value at a moment of training.
+
+        :param progress_remaining: fraction of training that remains, from 1 to 0
+        :return: value
         """
         return float(plain(self.value_schedule(progress_remaining), arrays=True))
 
 
 def constructor_arguments(algorithm: type) -> list[str]:
     """
-    :param algorithm: a class
-    :return: names of the arguments that are kept with a model, as the attribute of that name or as :data:`KEPT_AS` says
+    The constructor arguments of an algorithm that are kept with a model.
+
+    :param algorithm: class of the algorithm
+    :return: names of the arguments, each kept as the attribute of that name or of the name in :data:`KEPT_AS`
     """
     return [name for name in constructor_parameters(algorithm) if name not in ("env", "device", "_init_setup_model")]
 
 
 def constructor_parameters(kind: type) -> list[str]:
     """
-    :param kind: a class
-    :return: names of what it can be made with and, as long as it hands on what it does not know, of what its ancestors can
+    The names of all arguments that a class can be made with.
+
+    :param kind: class
+    :return: names of its constructor's arguments and, as far as constructors hand on further ones, of its ancestors'
     """
     names: dict[str, None] = {}
     for ancestor in kind.__mro__:
@@ -79,9 +87,9 @@ def constructor_parameters(kind: type) -> list[str]:
 
 def make_arguments_plain(model: BaseAlgorithm) -> None:
     """
-    Python's numbers in all arguments, see :func:`plain`.
+    Replace numbers of other libraries in all arguments by Python's numbers, see :func:`plain`.
 
-    :param model: whose attributes are the arguments
+    :param model: model whose attributes are the arguments
     """
     for argument in constructor_arguments(type(model)):
         name = KEPT_AS.get(argument, argument)
@@ -91,20 +99,22 @@ def make_arguments_plain(model: BaseAlgorithm) -> None:
 
 def merged(kind: type, table: str) -> dict[str, Any]:
     """
-    :param kind: a class
-    :param table: name of a mapping that it and its ancestors may have, each with entries of its own
-    :return: all entries, a class's over those of its ancestors
+    A table whose entries are spread over a class and its ancestors.
+
+    :param kind: class
+    :param table: name of the attribute that is a mapping, of the class or of an ancestor
+    :return: all entries, where those of a class take the place of its ancestors'
     """
     return {name: entry for ancestor in reversed(kind.__mro__) for name, entry in vars(ancestor).get(table, {}).items()}
 
 
 def check_arguments(model: Any) -> None:
     """
-    Each by the entry that ``argument_checks`` has for it.
+    Check each argument by its entry in ``argument_checks``.
 
-    :param model: whose attributes are the arguments, as they were given or as they were saved
-    :raises ValueError: naming the argument, what is allowed and what it was
-    :raises AttributeError: naming the argument that is not there yet
+    :param model: model whose attributes are the arguments, as they were given or saved
+    :raises ValueError: naming the argument, the values that are allowed, and the value that it has
+    :raises AttributeError: naming the argument that the model does not have yet
     """
     for argument, check in merged(type(model), "argument_checks").items():
         name = KEPT_AS.get(argument, argument)
@@ -118,9 +128,12 @@ def check_arguments(model: Any) -> None:
 
 def unless(other: Any, check: ArgumentCheck, **options: Any) -> ArgumentCheck:
     """
-    :param other: what may be given instead of what ``check`` allows
-    :param check: of all else
-    :param options: of ``check``
+    A check that allows one more value.
+
+    :param other: value that is allowed besides those that ``check`` allows
+    :param check: check of all other values
+    :param options: keyword arguments of ``check``
+    :return: check of an argument
     """
 
     def checked(name: str, value: Any) -> None:
@@ -132,14 +145,22 @@ def unless(other: Any, check: ArgumentCheck, **options: Any) -> ArgumentCheck:
 
 def check_switch(name: str, value: Any) -> None:
     """
-    :raises ValueError: unless it is true or false
+    Check an argument that is true or false.
+
+    :param name: name of the argument
+    :param value: value of the argument
+    :raises ValueError: unless the value is true or false
     """
     check_choice(name, value, (False, True))
 
 
 def check_compile(name: str, value: Any) -> None:
     """
-    :raises ValueError: unless it is true, false or "auto"
+    Check the argument ``compile``.
+
+    :param name: name of the argument
+    :param value: value of the argument
+    :raises ValueError: unless the value is true, false or "auto"
     """
     if value not in (False, True, "auto"):
         raise ValueError(f'{name} must be True, False or "auto", got {value!r}.')
@@ -147,7 +168,11 @@ def check_compile(name: str, value: Any) -> None:
 
 def check_device(name: str, value: Any) -> None:
     """
-    :raises ValueError: unless torch has such a device
+    Check the argument ``device``.
+
+    :param name: name of the argument
+    :param value: value of the argument
+    :raises ValueError: unless the value is "auto" or names one of torch's devices
     """
     try:
         th.device("cpu" if value == "auto" else value)
@@ -157,10 +182,13 @@ def check_device(name: str, value: Any) -> None:
 
 def check_train_freq(name: str, value: Any, n_envs: int = 1) -> None:
     """
-    :param name: of the argument
-    :param value: as given, or as SB3 converts it
+    Check the argument ``train_freq``.
+
+    :param name: name of the argument
+    :param value: value of the argument, as it was given or as SB3 converts it
     :param n_envs: number of environments
-    :raises ValueError: unless it is a number of steps, or (number, "step" | "episode")
+    :raises ValueError: unless the value is a number of steps, or (number, "step" | "episode"), where episodes go with a single
+        environment
     """
     allowed = f'{name} must be an integer >= 1 or (integer >= 1, "step" or "episode")'
     pair = value if isinstance(value, tuple) else (value, "step")
@@ -173,7 +201,11 @@ def check_train_freq(name: str, value: Any, n_envs: int = 1) -> None:
 
 def check_replay_buffer_class(name: str, value: Any) -> None:
     """
-    :raises ValueError: unless it is a class of buffers that hold Dict observations, or ``None``
+    Check the argument ``replay_buffer_class``.
+
+    :param name: name of the argument
+    :param value: value of the argument
+    :raises ValueError: unless the value is a class of buffers that hold Dict observations, or ``None``
     """
     if value is None:
         return
@@ -185,9 +217,9 @@ def check_replay_buffer_class(name: str, value: Any) -> None:
         )
 
 
-#: Of all algorithms' arguments; roles, heads and coefficients check their own, and what depends on others is checked with them
+#: Checks of the arguments that all algorithms have; roles, heads and coefficients check further ones, and combinations
 COMMON_CHECKS: Mapping[str, ArgumentCheck] = {
-    "learning_rate": partial(check_schedule, may_be_zero=True),  # so rl_zoo3 loads models to play with
+    "learning_rate": partial(check_schedule, may_be_zero=True),  # rl_zoo3 loads models with 0 to play them
     "gamma": check_fraction,
     "max_grad_norm": unless(None, check_positive, remedy="or None for no clipping"),
     "lr_scales": partial(check_type, types=(Mapping, type(None)), expected="a dict of networks or None"),
@@ -201,7 +233,7 @@ COMMON_CHECKS: Mapping[str, ArgumentCheck] = {
     "seed": unless(None, check_integer, low=0, high=LARGEST_SEED, remedy="or None"),
     "device": check_device,
 }
-#: Of those that off-policy algorithms have besides
+#: Checks of the further arguments of off-policy algorithms
 OFF_POLICY_CHECKS: Mapping[str, ArgumentCheck] = {
     "buffer_size": partial(check_integer, low=1),
     "learning_starts": check_not_negative,

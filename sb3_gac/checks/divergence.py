@@ -1,4 +1,4 @@
-"""Training that diverged: found where metrics come to the host anyway, and written down."""
+"""Divergence of training: it is noticed in the metrics of a round of gradient steps, and a diagnosis is written."""
 
 import json
 import math
@@ -16,9 +16,9 @@ class DivergenceError(RuntimeError):
     """
     A loss, a gradient norm or another metric is NaN or infinite.
 
-    :param message: which, when, and what to try
-    :param diagnosis: what :func:`diagnose` found
-    :param path: of the file that holds it, ``None`` if there is none
+    :param message: text that names the metrics, the step, and remedies to try
+    :param diagnosis: diagnosis that :func:`diagnose` returned
+    :param path: path of the file that holds the diagnosis; ``None`` if there is none
     """
 
     def __init__(self, message: str, diagnosis: dict[str, Any] | None = None, path: Path | None = None):
@@ -31,11 +31,13 @@ def check_finite_metrics(
     model: BaseAlgorithm, metrics: dict[str, float], last_good: Mapping[str, float], coefficients: Mapping[str, th.Tensor]
 ) -> None:
     """
-    :param model: that was trained
-    :param metrics: of the gradient steps just done
-    :param last_good: of the round before them
-    :param coefficients: learned or fixed ones of its losses
-    :raises DivergenceError: if one of the metrics is not finite
+    Check that all metrics are finite, and write a diagnosis if they are not.
+
+    :param model: model that was trained
+    :param metrics: name -> metric of the round of gradient steps just done
+    :param last_good: name -> metric of the round before
+    :param coefficients: name -> value of a coefficient of the losses, learned or fixed
+    :raises DivergenceError: if one of the metrics is NaN or infinite
     """
     not_finite = [name for name, value in metrics.items() if not math.isfinite(value)]
     if not not_finite:
@@ -57,11 +59,14 @@ def diagnose(
     model: BaseAlgorithm, metrics: dict[str, float], last_good: Mapping[str, float], coefficients: Mapping[str, th.Tensor]
 ) -> dict[str, Any]:
     """
-    :param model: that was trained
-    :param metrics: of the gradient steps just done
-    :param last_good: of the round before them
-    :param coefficients: of its losses
-    :return: all of it that JSON can hold, with the largest absolute values in a batch as the networks see it
+    Gather what may explain a divergence.
+
+    :param model: model that was trained
+    :param metrics: name -> metric of the round of gradient steps just done
+    :param last_good: name -> metric of the round before
+    :param coefficients: name -> value of a coefficient of the losses, learned or fixed
+    :return: diagnosis, in a form that JSON can hold: steps, metrics, coefficients, arguments, and the largest absolute values
+        in a batch as the networks see it
     """
     entries: Mapping[str, th.Tensor] = model.example_of_data()  # type: ignore[attr-defined]
     diagnosis = {
@@ -78,10 +83,12 @@ def diagnose(
 
 def write_diagnosis(diagnosis: dict[str, Any], directory: str | None, step: int) -> Path | None:
     """
-    :param diagnosis: of :func:`diagnose`
-    :param directory: of the logger, if it has one
-    :param step: for the file's name
-    :return: of the file; ``None`` if it could not be written, which must not hide why it was to be
+    Write a diagnosis to a file; a failure to do so raises no error, which would hide the divergence.
+
+    :param diagnosis: diagnosis that :func:`diagnose` returned
+    :param directory: directory of the logger; ``None`` if it has none
+    :param step: number of environment steps, for the file's name
+    :return: path of the file; ``None`` if it was not written
     """
     if directory is None:
         return None
@@ -94,13 +101,13 @@ def write_diagnosis(diagnosis: dict[str, Any], directory: str | None, step: int)
 
 
 def _arguments(model: BaseAlgorithm) -> dict[str, Any]:
-    """What the constructor was given, as far as the model has kept it."""
+    """Name -> constructor argument, for those that the model has kept."""
     names = [name for name in constructor_parameters(type(model)) if name in vars(model) and name != "env"]
     return {name: getattr(model, name) for name in names} | {"policy": model.policy_class.__name__}
 
 
 def _without_nan(value: Any) -> Any:
-    """The same for JSON, which has neither NaN nor infinity."""
+    """The value with text in place of NaN and infinity, which JSON does not have."""
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if isinstance(value, Mapping):

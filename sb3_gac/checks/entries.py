@@ -1,8 +1,8 @@
 """
 Observation entries: the spaces that they may have, the rows that they come in, and the numbers that encoders get.
 
-Whatever depends on an entry's kind (Box, Discrete, MultiDiscrete or MultiBinary) is here, and in what is known of a kind's
-values, :func:`sb3_gac.checks.values.index_bounds`.
+All code that depends on the kind of an entry's space (Box, Discrete, MultiDiscrete or MultiBinary) is here, except for the
+range of its values, :func:`sb3_gac.checks.values.index_bounds`.
 """
 
 from collections.abc import Mapping
@@ -17,11 +17,11 @@ from stable_baselines3.common.vec_env import VecTransposeImage
 
 from sb3_gac.checks.values import held_by, index_bounds, is_finite
 
-#: Types that torch does little with -> types that hold all of their values, or of uint64 as much as a network sees
+#: Types that torch computes little with -> types that hold all their values (those of uint64 rounded, as for networks anyway)
 COMPUTABLE = {"uint16": "int32", "uint32": "int64", "uint64": "float64"}
 FLOAT32 = np.dtype(np.float32)
 SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-#: Other kinds of spaces -> what to do instead
+#: Kinds of spaces that are not supported -> remedy
 REMEDIES: dict[type[spaces.Space], str] = {
     spaces.Text: "Encode it as numbers: as Discrete if it is one of several texts, as MultiDiscrete if not.",
     spaces.Sequence: "Pad it to a Box of its largest length.",
@@ -33,7 +33,7 @@ REMEDIES: dict[type[spaces.Space], str] = {
 
 
 class UnsupportedObservationError(NotImplementedError, ValueError):
-    """An observation's entry is of a kind that can't be learned from. SB3 raises NotImplementedError for nested ones."""
+    """An observation entry can't be learned from. SB3 raises NotImplementedError for nested spaces, so this is one as well."""
 
 
 # --- spaces -------------------------------------------------------------------------------------------------------------
@@ -41,8 +41,10 @@ class UnsupportedObservationError(NotImplementedError, ValueError):
 
 def check_entries(space: spaces.Space) -> None:
     """
-    :param space: of an environment's observations; those that are no Dict are not looked at
-    :raises UnsupportedObservationError: naming the first entry that can't be learned from, and what to do about it
+    Check that observation entries can be learned from.
+
+    :param space: observation space of an environment; one that is no Dict is not checked
+    :raises UnsupportedObservationError: naming the first entry that can't be learned from, and the remedy
     """
     if not isinstance(space, spaces.Dict):
         return
@@ -57,7 +59,7 @@ def check_entries(space: spaces.Space) -> None:
 
 
 def _unsupported(space: spaces.Space) -> str | None:
-    """What is wrong with the space of an entry, and the remedy; ``None`` if nothing is."""
+    """The fault of an entry's space and its remedy, in words; ``None`` if there is no fault."""
     if not isinstance(space, SUPPORTED):
         remedies = [remedy for kind, remedy in REMEDIES.items() if isinstance(space, kind)]
         remedy = remedies[0] if remedies else "Make it a Box, Discrete, MultiDiscrete or MultiBinary."
@@ -71,10 +73,12 @@ def _unsupported(space: spaces.Space) -> str | None:
 
 def check_held_by(buffer_class: type[ReplayBuffer] | None, space: spaces.Dict, own: type[ReplayBuffer]) -> None:
     """
-    :param buffer_class: ``replay_buffer_class``; ``None`` for one of our own
-    :param space: of the observations
-    :param own: base of those that hold every entry there may be
-    :raises ValueError: naming the entry that SB3's buffers can't hold
+    Check that a replay buffer can hold the observation's entries.
+
+    :param buffer_class: value of the argument ``replay_buffer_class``; ``None`` for a class of this package
+    :param space: observation space of the environment
+    :param own: base class of this package's buffers, which hold every supported entry
+    :raises ValueError: naming the first entry that SB3's buffers can't hold
     """
     if buffer_class is None or issubclass(buffer_class, own):
         return
@@ -88,8 +92,10 @@ def check_held_by(buffer_class: type[ReplayBuffer] | None, space: spaces.Dict, o
 
 def stored_shape(space: spaces.Space) -> tuple[int, ...]:
     """
-    :param space: of an entry
-    :return: the shape that buffers give it
+    The shape that replay buffers give to an entry.
+
+    :param space: space of the entry
+    :return: shape of one value
     """
     return (1,) if isinstance(space, spaces.Discrete) else space.shape  # type: ignore[return-value]
 
@@ -99,8 +105,10 @@ def stored_shape(space: spaces.Space) -> tuple[int, ...]:
 
 def encoded_size(space: spaces.Space) -> int:
     """
-    :param space: of an entry
-    :return: numbers that :func:`encode` makes of it
+    The size of an encoded entry.
+
+    :param space: space of the entry
+    :return: number of numbers in one value that :func:`encode` returns
     """
     if isinstance(space, spaces.Discrete):
         return int(space.n)
@@ -109,12 +117,13 @@ def encoded_size(space: spaces.Space) -> int:
 
 def encode(values: th.Tensor, space: spaces.Space, normalize_images: bool) -> th.Tensor:
     """
-    What SB3's ``preprocess_obs`` does to an entry; choices may count from any number and be of any shape.
+    Encode an entry as SB3's ``preprocess_obs`` does; discrete values may also count from any number and have any shape.
 
-    :param values: of an entry, shape (B, ...)
-    :param space: of that entry
-    :param normalize_images: divide images by 255
-    :return: float32: Box and MultiBinary in their own shape, (B, 1) if that is (); one-hot, shape (B, F), for the others
+    :param values: values of the entry, shape (B, ...)
+    :param space: space of the entry
+    :param normalize_images: whether to divide images by 255
+    :return: float32: Box and MultiBinary in their own shape, or (B, 1) if that is (); Discrete and MultiDiscrete one-hot,
+        shape (B, F)
     """
     choices = _choices(space)
     if choices:
@@ -127,7 +136,7 @@ def encode(values: th.Tensor, space: spaces.Space, normalize_images: bool) -> th
 
 @th.compiler.assume_constant_result
 def _choices(space: spaces.Space) -> list[tuple[int, int]]:
-    """Number of choices and the first one, of each of its numbers; a compiled program takes them as they are."""
+    """Number of choices, and the first choice, of each number in the space; constants for a compiled program."""
     if isinstance(space, spaces.Discrete):
         return [(int(space.n), int(space.start))]
     if isinstance(space, spaces.MultiDiscrete):
@@ -142,24 +151,28 @@ def _is_image(space: spaces.Space) -> bool:
 
 def leading_dimensions(values: th.Tensor, space: spaces.Space) -> int:
     """
-    :param values: of an entry, (B, ...) or, of sequences, (T, B, ...)
-    :param space: of that entry
-    :return: 1 or 2
+    The number of leading dimensions of an entry's values.
+
+    :param values: values of the entry, shape (B, ...), or (T, B, ...) for sequences
+    :param space: space of the entry
+    :return: 1, or 2 for sequences
     """
-    if isinstance(space, spaces.Discrete):  # (B,) where a policy acts, and with one more dimension from buffers
+    if isinstance(space, spaces.Discrete):  # shape (B,) where a policy acts, (B, 1) or (T, B, 1) from buffers
         return max(values.dim() - 1, 1)
     return values.dim() - len(space.shape)  # type: ignore[arg-type]
 
 
 def _one_hot(values: th.Tensor, n: int, start: int) -> th.Tensor:
-    """Shape (B, n); zeros for what is none of the choices, such as the padding of a sequence."""
+    """One-hot vectors, shape (B, n); zeros for values that are none of the choices, such as the padding of a sequence."""
     return (values.long().unsqueeze(-1) == th.arange(start, start + n, device=values.device)).float()
 
 
 def computable(array: np.ndarray) -> np.ndarray:
     """
-    :param array: of any type that an entry may have
-    :return: the same, in a type that torch computes with
+    Convert an array to a type that torch computes with.
+
+    :param array: array of any type that an entry may have
+    :return: array of the same values, or the same array
     """
     return array.astype(COMPUTABLE[array.dtype.name]) if array.dtype.name in COMPUTABLE else array
 
@@ -169,10 +182,10 @@ def computable(array: np.ndarray) -> np.ndarray:
 
 class EntryReader:
     """
-    Takes an entry as ``predict`` is given it, whatever holds the numbers, or says what is wrong with it.
+    Reads an entry in any form that ``predict`` may be given, or says what is wrong with it.
 
-    :param key: its name
-    :param space: of the entry
+    :param key: name of the entry
+    :param space: space of the entry
     """
 
     def __init__(self, key: str, space: spaces.Space):
@@ -184,9 +197,11 @@ class EntryReader:
 
     def read(self, value: Any) -> tuple[np.ndarray, int | None]:
         """
-        :param value: one of the entry, or B of them, as an array, a tensor, a list or a number; images in either layout
-        :return: a copy of shape (B, \\*entry shape), and B; ``None`` instead if it was one by itself
-        :raises ValueError: naming the entry, if its type or its shape is another, or its values are none that it can have
+        Read one value of the entry or a batch.
+
+        :param value: value, or B of them, as an array, a tensor, a list or a number; images in either layout
+        :return: copy of shape (B, \\*entry shape), and B, or ``None`` in its place for one value by itself
+        :raises ValueError: naming the entry, if the value's type or shape does not fit the space, or the value is not in it
         """
         array = self._with_layout(self._as_array(value))
         if array.dtype != self.dtype or self.dtype.kind == "f":
@@ -211,7 +226,7 @@ class EntryReader:
         return array
 
     def _with_layout(self, array: np.ndarray) -> np.ndarray:
-        """With the channels where the space has them."""
+        """The array with an image's channels on the axis where the space has them."""
         if array.shape == self.shape or (array.shape[1:] == self.shape and array.ndim):
             return array
         if self.is_image and array.ndim in (3, 4):
@@ -221,7 +236,11 @@ class EntryReader:
         raise self._fault(f"has shape {array.shape}, expected {self.shape}, or (B, ...) of it")
 
     def _as_declared(self, array: np.ndarray) -> np.ndarray:
-        """Floats as they are, where it is measured: networks take all of them, and normalised integers are floats as well."""
+        """
+        The array in the declared type.
+
+        Floats of a Box stay as they are, whatever its type: networks take all of them, and normalised integers are floats.
+        """
         if array.dtype.kind == "f" and not is_finite(array, array.dtype):
             raise self._fault("holds NaN or infinite values: no action can follow from it")
         if self.is_image and array.dtype.kind in "fb":
@@ -243,9 +262,9 @@ class EntryReader:
 
 class ObservationReader:
     """
-    Takes observations as ``predict`` is given them.
+    Reads observations in any form that ``predict`` may be given.
 
-    :param space: of the entries to read
+    :param space: space of the entries to read
     """
 
     def __init__(self, space: spaces.Dict):
@@ -253,10 +272,13 @@ class ObservationReader:
 
     def read(self, observation: Mapping[str, Any], device: th.device) -> tuple[dict[str, th.Tensor], bool]:
         """
-        :param observation: entry -> one, or B of each; those that are not in the space are left out
-        :param device: of the result
-        :return: tensors of the space's entries that are there, shapes (B, ...), and whether they were batched
-        :raises ValueError: naming the entry that does not fit its space, or is not as many as the others
+        Read one observation or a batch.
+
+        :param observation: entry -> one value, or B values; entries that are not in the space are left out
+        :param device: device of the tensors
+        :return: entry -> tensor of shape (B, ...), for the entries of the space that are there, and whether the observation
+            was a batch
+        :raises ValueError: naming the entry that does not fit its space, or whose batch size differs from the others'
         """
         tensors, counts = {}, {}
         for entry in self.entries:
@@ -275,7 +297,10 @@ class ObservationReader:
 
 def check_is_observation(observation: Any) -> None:
     """
-    :raises ValueError: if it is the pair that a gymnasium environment's ``reset()`` returns
+    Check that an observation is not the pair that a gymnasium environment's ``reset()`` returns.
+
+    :param observation: argument that was passed as the observation
+    :raises ValueError: if it is that pair
     """
     if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What stands before vectorised environments: it names the environment that failed, before its values do harm."""
+"""A guard of vectorised environments, which names an environment that fails before its values do harm."""
 
 import traceback
 from collections.abc import Callable, Sequence
@@ -24,10 +24,10 @@ from sb3_gac.checks.values import described, entries_of
 
 GUARD = "_environment_guard"
 TRUNCATED = "TimeLimit.truncated"  # SB3's name of an end by time limit in an info
-RAW_FINAL = "raw_terminal_observation"  # in an info: what VecNormalize replaces under FINAL
+RAW_FINAL = "raw_terminal_observation"  # key in an info of the observation that VecNormalize replaces under FINAL
 ONE_AFTER_THE_OTHER = (DummyVecEnv.step_wait.__code__, DummyVecEnv.reset.__code__)
-REWARD_IS_TAKEN = (DummyVecEnv.step_wait.__code__, Monitor.step.__code__)  # by SB3, which makes a number of it
-NO_NUMBER = ("0-dimensional arrays", "size-1 arrays", "array element with a sequence", "float() argument")  # so numpy says it
+REWARD_IS_TAKEN = (DummyVecEnv.step_wait.__code__, Monitor.step.__code__)  # where SB3 makes a number of the reward
+NO_NUMBER = ("0-dimensional arrays", "size-1 arrays", "array element with a sequence", "float() argument")  # numpy's words
 
 
 class EnvironmentFailedError(RuntimeError):
@@ -39,9 +39,9 @@ FAULTS = (InvalidStepError, EnvironmentFailedError)
 
 def guard_environments(env: VecEnv) -> None:
     """
-    Before ``VecNormalize``, if there is one, learns from them, and before they are stored.
+    Have the environments' values checked before they are stored, and before ``VecNormalize``, if there is one, learns them.
 
-    :param env: gets a guard, unless it has one
+    :param env: vectorised environments, which get a guard unless they have one
     """
     guarded = _guarded(env)
     if GUARD not in vars(guarded):  # getattr would find that of an environment further in
@@ -50,8 +50,10 @@ def guard_environments(env: VecEnv) -> None:
 
 def guard_of(env: VecEnv) -> "EnvironmentGuard":
     """
-    :param env: of :func:`guard_environments`
-    :return: its guard
+    The guard of vectorised environments.
+
+    :param env: environments that :func:`guard_environments` was given
+    :return: their guard
     """
     return vars(_guarded(env))[GUARD]
 
@@ -63,10 +65,10 @@ def _guarded(env: VecEnv) -> VecEnv:
 
 class EnvironmentGuard:
     """
-    Takes the place of an instance's ``reset``, ``step_async`` and ``step_wait``.
+    Checks all that vectorised environments take and return, in place of their ``reset``, ``step_async`` and ``step_wait``.
 
-    It is no wrapper, because SB3 goes through the wrappers of training and evaluation environments side by side
-    (``sync_envs_normalization``) and compares their types: a guard must not show.
+    The guard replaces these methods of the instance and is no wrapper: SB3 goes through the wrappers of training and
+    evaluation environments side by side (``sync_envs_normalization``) and compares their types.
 
     :param env: vectorised environments
     """
@@ -76,12 +78,12 @@ class EnvironmentGuard:
         self._entries = entries_in(env.observation_space)
         self._base_entries = entries_in(self.base.observation_space)
         self._failure: str | None = None
-        #: Of those that DummyVecEnv steps one after the other: how many are done in the call under way
+        #: Number of environments that DummyVecEnv, which steps one after the other, has done in the call under way
         self._done = 0
         self._calls = 0
         self._uses_inside: list[EnvironmentUse] = []
         self._ends = SuspiciousEnds()
-        #: SB3's own return new arrays; of others, and of wrappers, it is not known
+        #: Whether returned arrays are new, which is known of SB3's own classes without wrappers
         self._returns_new_arrays = type(env) in (DummyVecEnv, SubprocVecEnv)
         self._reset, self._step_async, self._step_wait = env.reset, env.step_async, env.step_wait
         vars(env).update(reset=self.reset, step_async=self.step_async, step_wait=self.step_wait)
@@ -99,16 +101,18 @@ class EnvironmentGuard:
 
     @property
     def uses(self) -> int:
-        """Steps and resets so far, of these vectorised environments or of an environment in them."""
+        """Number of steps and resets so far, of these vectorised environments or of an environment in them."""
         pipes = self.base.remotes if isinstance(self.base, SubprocVecEnv) else ()
         return self._calls + sum(use.count for use in self._uses_inside) + sum(pipe.uses for pipe in pipes)
 
-    # --- in the place of the environments' own ------------------------------------------------------------------------
+    # --- in place of the environments' methods ------------------------------------------------------------------------
 
     def reset(self) -> Any:
         """
+        Reset all environments.
+
         :return: the environments' observations
-        :raises InvalidStepError: if one does not fit its space or is not finite
+        :raises InvalidStepError: if an observation does not fit its space or is not finite
         :raises EnvironmentFailedError: if an environment fails
         """
         self._calls += 1
@@ -118,8 +122,10 @@ class EnvironmentGuard:
 
     def step_async(self, actions: np.ndarray) -> None:
         """
-        :param actions: one for each environment
-        :raises InvalidStepError: if one is not finite
+        Begin a step of all environments.
+
+        :param actions: action of each environment, shape (n_envs, ...)
+        :raises InvalidStepError: if an action is not finite
         :raises EnvironmentFailedError: if an environment's process has died
         """
         finite = np.isfinite(actions)
@@ -133,8 +139,11 @@ class EnvironmentGuard:
 
     def step_wait(self) -> Any:
         """
+        Finish the step of all environments.
+
         :return: the environments' observations, rewards, dones and infos
-        :raises InvalidStepError: if one does not fit its space or is not finite
+        :raises InvalidStepError: if an observation or a reward does not fit its space or is not finite, or if the infos do not
+            fit the dones
         :raises EnvironmentFailedError: if an environment fails
         """
         observation, rewards, dones, infos = self._call(self._step_wait)
@@ -149,11 +158,11 @@ class EnvironmentGuard:
 
     def save_obs(self, index: int, observation: Any) -> None:
         """
-        DummyVecEnv would broadcast a wrong shape and cast a wrong type where it copies an observation into its buffer.
+        Check an observation before DummyVecEnv copies it, and so would broadcast a wrong shape or cast a wrong type.
 
-        :param index: of the environment
-        :param observation: as it returned it
-        :raises InvalidStepError: if it does not fit its space or is not finite
+        :param index: index of the environment
+        :param observation: observation that the environment returned
+        :raises InvalidStepError: if the observation does not fit its space or is not finite
         """
         entries = entries_of(observation)
         for key, entry in self._base_entries.items():
@@ -164,7 +173,7 @@ class EnvironmentGuard:
         self._done = index + 1
 
     def close(self) -> None:
-        """Processes of which one has died, or was interrupted within a message, can't be told to end: they are ended."""
+        """Close the environments; if a process has died or was interrupted within a message, end all processes instead."""
         try:
             self._close()
         except (EOFError, OSError):
@@ -173,7 +182,7 @@ class EnvironmentGuard:
     # --- checks -------------------------------------------------------------------------------------------------------
 
     def _check_number(self, rewards: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
-        """One reward, one end and one info of each environment: numpy would broadcast others."""
+        """Check that there is one reward, done and info for each environment, because numpy would broadcast others."""
         n_envs = self.env.num_envs
         shapes = {"rewards": np.shape(rewards)[:1], "dones": np.shape(dones), "infos": (len(infos),)}
         for name, shape in shapes.items():
@@ -183,7 +192,7 @@ class EnvironmentGuard:
                 )
 
     def _check_ends(self, observation: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
-        """An info tells of an episode's end when there is one, and then of this one."""
+        """Check that the info of an ended episode holds its last observation; remove what earlier ends left in other infos."""
         for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
             if done:
                 if FINAL not in info:
@@ -195,14 +204,14 @@ class EnvironmentGuard:
                 check_entries(info[FINAL], self._entries, index, "The last observation's entry")
                 info[RAW_FINAL] = info[FINAL]
             elif (FINAL in info or info.get(TRUNCATED)) and not _is_of_another(info, index, dones, infos):
-                for key in (FINAL, TRUNCATED, RAW_FINAL):  # left from an earlier end, in a dict that is used again
+                for key in (FINAL, TRUNCATED, RAW_FINAL):  # of an earlier end, in a dict that is used again
                     info.pop(key, None)
         if dones.any():
             _check_own_infos(dones, infos)
         self._ends.look_at(observation, dones, infos)
 
     def _own(self, observation: Any) -> Any:
-        """Arrays that no later step changes."""
+        """The observation in arrays that no later step changes."""
         if self._returns_new_arrays:
             return observation
         return deepcopy(observation)
@@ -224,7 +233,7 @@ class EnvironmentGuard:
             raise fault from error
 
     def _explained(self, error: Exception) -> Exception | None:
-        """What to raise instead of an error that came out of an environment; ``None`` if it came from elsewhere."""
+        """The error to raise in place of one that came out of an environment; ``None`` if the error came from elsewhere."""
         if isinstance(self.base, SubprocVecEnv) and isinstance(error, (EOFError, OSError)):
             self._failure = end_processes(self.base)
             return EnvironmentFailedError(self._failure)
@@ -240,7 +249,7 @@ class EnvironmentGuard:
         return self._fault_in_answers() if isinstance(self.base, SubprocVecEnv) else None
 
     def _fault_in_answers(self) -> InvalidStepError | None:
-        """Of what the processes have sent: SubprocVecEnv can't put together observations that do not fit their space."""
+        """The fault of an observation that a process has sent and that SubprocVecEnv therefore can't put together."""
         for index, pipe in enumerate(self.base.remotes):  # type: ignore[attr-defined]
             if isinstance(pipe.answer, tuple):
                 try:
@@ -251,13 +260,15 @@ class EnvironmentGuard:
 
 
 def _is_of_another(info: dict[str, Any], index: int, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> bool:
-    """Whether the info is the very dict of another environment, whose episode has ended."""
+    """Whether an info is the same dict as that of another environment whose episode has ended."""
     return any(infos[other] is info for other in np.flatnonzero(dones).tolist() if other != index)
 
 
 def _check_own_infos(dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
     """
-    :raises InvalidStepError: if two environments whose episodes have ended have one info between them
+    :param dones: booleans, true where an episode has ended, shape (n_envs,)
+    :param infos: info dict of each environment
+    :raises InvalidStepError: if two environments whose episodes have ended share one info dict
     """
     ended = np.flatnonzero(dones).tolist()
     for position, index in enumerate(ended):

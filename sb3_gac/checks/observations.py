@@ -1,4 +1,4 @@
-"""What environments return, against their spaces: a fault names the entry and the environment."""
+"""Checks of values that environments return against their spaces; an error names the entry and the environment."""
 
 from typing import Any, NamedTuple
 
@@ -16,12 +16,12 @@ class InvalidStepError(ValueError):
 
 class Entry(NamedTuple):
     """
-    What is to be known of an entry in every step.
+    Properties of an observation entry that the check of each step needs.
 
-    :param space: of one environment's
-    :param shape: of that space
-    :param dtype: of that space
-    :param bounds: see :func:`index_bounds`
+    :param space: space of the entry in one environment
+    :param shape: shape of that space
+    :param dtype: type of that space's numbers
+    :param bounds: smallest and largest value of a discrete kind of space, else ``None``, see :func:`index_bounds`
     """
 
     space: spaces.Space
@@ -32,7 +32,10 @@ class Entry(NamedTuple):
     @classmethod
     def of(cls, space: spaces.Space) -> "Entry":
         """
-        :param space: of one environment's
+        Look up the properties of an entry.
+
+        :param space: space of the entry in one environment
+        :return: properties of the entry
         """
         return cls(space, space.shape, space.dtype, index_bounds(space))
 
@@ -41,17 +44,22 @@ REWARD = Entry.of(spaces.Box(-np.inf, np.inf, (), np.float32))
 
 
 def entries_in(space: spaces.Space) -> dict[str, Entry]:
-    """Those of an observation's entries that are single arrays."""
+    """
+    The entries of observations that are single arrays.
+
+    :param space: observation space; one that is no Dict has one entry, "observation"
+    :return: name -> properties of the entry
+    """
     entries = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
     return {key: Entry.of(entry) for key, entry in entries.items() if entry.shape is not None}
 
 
 def check_observation(observation: Any, expected: dict[str, Entry]) -> None:
     """
-    One look at each entry of all environments together.
+    Check an observation of all environments, each entry at once.
 
-    :param observation: of all environments
-    :param expected: its entries
+    :param observation: observations of all environments together
+    :param expected: name -> properties of the entries that there must be
     :raises InvalidStepError: naming the entry and the environment
     """
     entries = entries_of(observation)
@@ -66,10 +74,12 @@ def check_observation(observation: Any, expected: dict[str, Entry]) -> None:
 
 def check_entries(observation: Any, expected: dict[str, Entry], index: int, what: str = "The observation's entry") -> None:
     """
-    :param observation: of one environment
-    :param expected: its entries
-    :param index: of the environment
-    :param what: the entries' kind, for the message
+    Check an observation of one environment.
+
+    :param observation: observation of the environment
+    :param expected: name -> properties of the entries that there must be
+    :param index: index of the environment
+    :param what: subject of the message, before the entry's name
     :raises InvalidStepError: naming the entry and the environment
     """
     entries = entries_of(observation)
@@ -81,11 +91,11 @@ def check_entries(observation: Any, expected: dict[str, Entry], index: int, what
 
 def check_rows(name: str, rows: Any, entry: Entry) -> None:
     """
-    One look at all environments together; at each by itself only if something may be wrong.
+    Check an entry, or the reward, of all environments at once, and each by itself only if something may be wrong.
 
-    :param name: for the message
-    :param rows: one for each environment
-    :param entry: what each is to be
+    :param name: name of the entry, for the message
+    :param rows: value of each environment, shape (n_envs, ...)
+    :param entry: properties that each value must have
     :raises InvalidStepError: naming the environment
     """
     bounds = entry.bounds
@@ -104,7 +114,7 @@ def check_rows(name: str, rows: Any, entry: Entry) -> None:
 
 
 def _comes_in(given: Any, expected: Any) -> bool:
-    """Whether the type is the expected one, or one whose numbers a floating-point entry takes as they are."""
+    """Whether a type is the expected one, or one whose numbers a floating-point entry takes as they are."""
     return given == expected or (expected.kind == "f" and given.kind in "biuf")
 
 

@@ -1,4 +1,4 @@
-"""Environments in other processes: answers that belong to their requests, and processes that die."""
+"""Environments in other processes: pipes whose answers belong to their requests, and the end of processes that died."""
 
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
@@ -8,30 +8,30 @@ from typing import Any
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 KEPT = "The step was discarded; the model is intact."
-PATIENCE = 2.0  # seconds that a process whose pipe has closed has to end
+PATIENCE = 2.0  # seconds to wait for an answer before asking whether the process is alive, or for the end of a process
 
 
 class WatchedPipe:
     """
     A pipe to a process, each of whose answers belongs to the request before it.
 
-    An interrupt between the two leaves an answer that nobody has fetched: it is thrown away before the next request, or all
-    later ones would be those to earlier requests. One within a message leaves a pipe that can't be used any more. And a
-    process that was forked earlier holds the far end open as well, so that a death does not show in the pipe, and whoever
-    waits for an answer would wait for ever.
+    An interrupt between request and answer leaves an answer that nobody has fetched. The pipe throws it away before the next
+    request, or all later answers would be those to earlier requests. An interrupt within a message leaves a pipe that can't
+    be used any more. A process that was forked earlier holds the far end open as well, so that a death does not show in the
+    pipe. Whoever waits for an answer therefore asks from time to time whether the process is alive.
 
-    :param pipe: to it
-    :param process: at its far end
+    :param pipe: connection to the process
+    :param process: process at the far end
     """
 
     def __init__(self, pipe: Connection, process: BaseProcess):
         self._pipe, self._process = pipe, process
         self._awaits_answer = False
-        #: Whether a message is under way, or was when an interrupt came
+        #: Whether a message is under way, or was under way when an interrupt came
         self.torn = False
-        #: To the last request; that to a step or a reset begins with the observation
+        #: Answer to the last request; an answer to a step or a reset begins with the observation
         self.answer: Any = None
-        #: Steps and resets that were asked for, by whatever way
+        #: Number of steps and resets that were requested, by any of SubprocVecEnv's methods
         self.uses = 0
 
     def __getattr__(self, name: str) -> Any:
@@ -39,8 +39,10 @@ class WatchedPipe:
 
     def send(self, request: Any) -> None:
         """
-        :param request: to the process, which answers each but the last, "close"
-        :raises EOFError: if it has died, or an exchange with it was interrupted within a message
+        Send a request.
+
+        :param request: request to the process, which answers each except the last, "close"
+        :raises EOFError: if the process has died, or an exchange with it was interrupted within a message
         """
         if self._awaits_answer:
             self.recv()
@@ -51,8 +53,10 @@ class WatchedPipe:
 
     def recv(self) -> Any:
         """
-        :return: what the process sends; ``None`` if that was fetched before
-        :raises EOFError: if it has died, or an exchange with it was interrupted within a message
+        Wait for the answer to the last request.
+
+        :return: answer of the process; ``None`` if no answer is due
+        :raises EOFError: if the process has died, or an exchange with it was interrupted within a message
         """
         if not self._awaits_answer:
             return None
@@ -69,7 +73,7 @@ class WatchedPipe:
         self.torn = True
         try:
             result = method(*args)
-        except Exception:  # the process has died, or the whole message was read and can't be understood
+        except Exception:  # the process has died, or the whole message was read and can't be decoded
             self.torn = False
             raise
         self.torn = False
@@ -77,17 +81,17 @@ class WatchedPipe:
 
 
 def _is_use(request: Any) -> bool:
-    """Whether SubprocVecEnv asks for a step or a reset: itself, or by ``env_method``."""
+    """Whether a request of SubprocVecEnv is for a step or a reset, directly or by ``env_method``."""
     command, data = request
     return (data[0] if command == "env_method" else command) in ("step", "reset")
 
 
 def end_processes(env: SubprocVecEnv) -> str:
     """
-    Without one of its processes, such an environment can neither be stepped nor closed: the others would wait for ever.
+    End all processes of environments of which one is lost; they could neither be stepped nor closed otherwise.
 
-    :param env: of which a process has died, or an exchange with it was interrupted within a message
-    :return: which one, and what to do
+    :param env: environments of which a process has died, or an exchange with it was interrupted within a message
+    :return: text that names the lost process and the remedy
     """
     torn = [index for index, remote in enumerate(env.remotes) if getattr(remote, "torn", False)]
     if not torn:

@@ -1,4 +1,4 @@
-"""What algorithms and SB3's ``HerReplayBuffer`` need of an environment, looked at before training."""
+"""Checks, before training, of what algorithms and SB3's ``HerReplayBuffer`` need of an environment."""
 
 import warnings
 from collections.abc import Collection, Mapping
@@ -24,9 +24,11 @@ REWARDS_OF_GOALS = (
 
 def check_environment(env: GymEnv) -> None:
     """
-    :param env: as it is given to a model
-    :raises ValueError: if it is one of gymnasium's vector environments, or naming an observation entry, or a component of Box
-        actions, that there is no learning with
+    Check that a model can learn in an environment.
+
+    :param env: environment in the form that a model is given it
+    :raises ValueError: if the environment is one of gymnasium's vector environments, or naming an observation entry or a
+        component of Box actions that is not supported
     """
     if isinstance(env, VectorEnv):
         raise ValueError(
@@ -42,11 +44,11 @@ def check_environment(env: GymEnv) -> None:
 
 def warn_of_an_unseen_goal(role: str, seen: Collection[str], space: spaces.Space) -> None:
     """
-    Warn if a goal is an entry of its own that the deployed policy does not read: it would learn to do well on average.
+    Warn if the deployed policy does not read a goal that is an entry of its own: it would learn to do well on average.
 
-    :param role: of the deployed policy
-    :param seen: entries that it reads
-    :param space: of the observations
+    :param role: role of the deployed policy
+    :param seen: names of the entries that the deployed policy reads
+    :param space: observation space of the environment
     """
     if isinstance(space, spaces.Dict) and DESIRED_GOAL in space.spaces and DESIRED_GOAL not in seen:
         warnings.warn(
@@ -58,10 +60,12 @@ def warn_of_an_unseen_goal(role: str, seen: Collection[str], space: spaces.Space
 
 def check_goals(buffer_class: Any, space: spaces.Dict, env: VecEnv | None) -> None:
     """
-    :param buffer_class: ``replay_buffer_class``
-    :param space: of the observations
-    :param env: whose ``compute_reward`` rewards other goals; ``None`` where there is none
-    :raises ValueError: if this is ``HerReplayBuffer`` and there are no goals, or there is no ``compute_reward``
+    Check that an environment has the goals that ``HerReplayBuffer`` needs.
+
+    :param buffer_class: value of the argument ``replay_buffer_class``; only ``HerReplayBuffer`` is checked
+    :param space: observation space of the environment
+    :param env: environments whose ``compute_reward`` rewards other goals; ``None`` if there are none yet
+    :raises ValueError: if goals are missing or of different shapes, or if there is no ``compute_reward``
     """
     if not _is_hindsight(buffer_class):
         return
@@ -85,18 +89,18 @@ def check_goals(buffer_class: Any, space: spaces.Dict, env: VecEnv | None) -> No
 
 def check_rewards_of_goals(buffer_class: Any, buffer_kwargs: Mapping[str, Any], env: VecEnv) -> None:
     """
-    Calls ``compute_reward`` as ``HerReplayBuffer`` will, on goals of zeros.
+    Check ``compute_reward`` by a call as ``HerReplayBuffer`` will make it, on goals of zeros.
 
-    :param buffer_class: ``replay_buffer_class``
-    :param buffer_kwargs: of it
-    :param env: after its reset
+    :param buffer_class: value of the argument ``replay_buffer_class``; only ``HerReplayBuffer`` is checked
+    :param buffer_kwargs: value of the argument ``replay_buffer_kwargs``
+    :param env: environments, after their reset
     :raises ValueError: if ``compute_reward`` does not reward many goals at once
     """
-    if not _is_hindsight(buffer_class) or buffer_kwargs.get("copy_info_dict", False):  # what is in infos can't be known
+    if not _is_hindsight(buffer_class) or buffer_kwargs.get("copy_info_dict", False):  # the content of infos is not known
         return
     goals_of = [env.observation_space.spaces[goal] for goal in GOALS]  # type: ignore[attr-defined]
     shape = stored_shape(goals_of[0])
-    n_rows = next(n for n in range(2, len(shape) + 3) if n not in shape)  # so that another axis shows
+    n_rows = next(n for n in range(2, len(shape) + 3) if n not in shape)  # so that a wrong axis shows
     goals = [np.zeros((n_rows, *shape), dtype=goal.dtype) for goal in goals_of]
     try:
         (rewards,) = env.env_method("compute_reward", *goals, [{} for _ in range(n_rows)], indices=[0])

@@ -1,4 +1,4 @@
-"""What is to be known of environments in this process: who uses them, and what becomes of an episode's last observation."""
+"""Observers of environments in this process: of who uses them, and of each episode's last observation."""
 
 import warnings
 import weakref
@@ -18,10 +18,11 @@ SUSPICIOUS_ENDS = 5
 
 class EnvironmentUse:
     """
-    Counts steps and resets of an environment, whoever calls them: an evaluation may have it in vectorised environments of
-    its own.
+    Counts steps and resets of an environment, whoever calls them.
 
-    :param env: without wrappers
+    An evaluation, for example, may step the same environment from vectorised environments of its own.
+
+    :param env: environment without wrappers
     """
 
     def __init__(self, env: Any):
@@ -32,29 +33,33 @@ class EnvironmentUse:
     @classmethod
     def of(cls, env: Any) -> "EnvironmentUse":
         """
-        :param env: with or without wrappers
-        :return: the one that counts for it
+        The counter of an environment, made at the first call.
+
+        :param env: environment with or without wrappers
+        :return: counter of the environment
         """
         inner = env.unwrapped
         return vars(inner)[USE] if USE in vars(inner) else cls(inner)
 
     def step(self, *args: Any, **kwargs: Any) -> Any:
-        """In the place of the environment's own."""
+        """Count a step and take it; this method replaces the environment's ``step``."""
         self.count += 1
         return self._step(*args, **kwargs)
 
     def reset(self, *args: Any, **kwargs: Any) -> Any:
-        """In the place of the environment's own."""
+        """Count a reset and make it; this method replaces the environment's ``reset``."""
         self.count += 1
         return self._reset(*args, **kwargs)
 
 
 class KeepingFinal:
     """
-    In the place of an environment's ``reset``: DummyVecEnv holds an episode's last observation by reference, and the
-    environment may write the next episode's first one into the same arrays.
+    Copies an episode's last observation before the environment's ``reset``, which it replaces.
 
-    :param reset: the environment's own
+    DummyVecEnv holds the last observation by reference, and the environment may write the next episode's first observation
+    into the same arrays.
+
+    :param reset: the environment's own ``reset``
     """
 
     def __init__(self, reset: Callable[..., Any]):
@@ -64,21 +69,25 @@ class KeepingFinal:
     @classmethod
     def of(cls, env: Any) -> "KeepingFinal":
         """
-        :param env: as DummyVecEnv has it
-        :return: what is in the place of its ``reset`` from now on
+        Replace an environment's ``reset``, unless that is done already.
+
+        :param env: environment with the wrappers that it has in DummyVecEnv
+        :return: object that replaces the environment's ``reset``
         """
         if not isinstance(vars(env).get("reset"), cls):
             vars(env)["reset"] = cls(env.reset)
         return vars(env)["reset"]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Of a copy of the environment it is not known where that will be held."""
+        """State for a copy of the environment, without places: where the copy will be held is not known."""
         return {"_reset": self._reset, "_places": []}
 
     def add(self, vec_env: DummyVecEnv, index: int) -> None:
         """
-        :param vec_env: that holds the environment
-        :param index: under which it does
+        Add a place where the environment is held.
+
+        :param vec_env: vectorised environments that hold the environment
+        :param index: index of the environment among them
         """
         self._places = [place for place in self._places if place[0]() is not None] + [(weakref.ref(vec_env), index)]
 
@@ -93,8 +102,10 @@ class KeepingFinal:
 
 class SuspiciousEnds:
     """
-    Says once if the last observation of every episode is the first one of the next. An environment in another process that
-    writes into the arrays it returned before looks like that, and so does one that is asked for it after its reset.
+    Warns once if the last observation of each of several episodes equals the first observation of the next.
+
+    The two are equal if an environment in another process writes into arrays that it returned before, or if the last
+    observation is taken after the reset.
     """
 
     def __init__(self) -> None:
@@ -103,9 +114,11 @@ class SuspiciousEnds:
 
     def look_at(self, observation: Any, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
         """
-        :param observation: of all environments, after a step
-        :param dones: whether an episode has ended, shape (n_envs,)
-        :param infos: with the last observations
+        Look at a step of all environments.
+
+        :param observation: observations of all environments after the step
+        :param dones: booleans, true where the step ended an episode, shape (n_envs,)
+        :param infos: info dict of each environment, which holds the last observation of an episode that has ended
         """
         if self._in_a_row < SUSPICIOUS_ENDS:
             now, before = entries_of(observation), self._before
@@ -126,5 +139,5 @@ class SuspiciousEnds:
 
 
 def _are_equal(final: Mapping[str, Any], observation: Mapping[str, Any], index: int) -> bool:
-    """Whether an episode's last observation is what an environment has among those of all."""
+    """Whether an episode's last observation equals that of environment ``index`` in the observations of all."""
     return all(np.array_equal(final[key], values[index]) for key, values in observation.items())

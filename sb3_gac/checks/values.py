@@ -14,16 +14,18 @@ from sb3_gac.schedules import read_schedule
 
 
 class UnsupportedActionSpaceError(AssertionError, ValueError):
-    """The algorithm can't act in this action space. SB3 raises AssertionError here, so this is one as well."""
+    """The algorithm does not support the action space. SB3 raises AssertionError here, so this is one as well."""
 
 
-# --- others' words ------------------------------------------------------------------------------------------------------
+# --- texts of errors ----------------------------------------------------------------------------------------------------
 
 
 def as_sentence(said: object) -> str:
     """
-    :param said: an error, or anything else whose text comes from elsewhere
-    :return: its text, which others may follow: with a full stop, whether it came with one or not
+    The text of an error as a sentence, which further sentences may follow.
+
+    :param said: error, or anything else whose text comes from elsewhere
+    :return: text, which ends with a full stop whether it came with one or not
     """
     text = str(said).strip()
     return text if text.endswith((".", "!", "?")) else f"{text}."
@@ -31,8 +33,10 @@ def as_sentence(said: object) -> str:
 
 def described(error: Exception) -> str:
     """
-    :param error: any
-    :return: its type and what it says, if it says anything, as a sentence
+    The description of an error as a sentence.
+
+    :param error: error of any type
+    :return: type of the error and its text, if it has one
     """
     name = type(error).__name__
     return as_sentence(f"{name}: {error}" if str(error).strip() else name)
@@ -45,11 +49,11 @@ def plain(value: Any, arrays: bool = False) -> Any:
     """
     Python's own numbers in place of numpy's, torch's and other libraries', also inside of dicts, lists and tuples.
 
-    Files that hold others can't be read without executing what they say.
+    A file that holds numbers of other libraries can't be read without executing its content.
 
-    :param value: anything
-    :param arrays: whether arrays with dimensions become a number, if they hold one, or lists; if not, they stay as they are
-    :return: the same, of Python's numbers
+    :param value: value of any type
+    :param arrays: whether arrays with dimensions are converted too: to a number if they hold a single one, else to lists
+    :return: value with Python's numbers
     """
     if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
         number = value.item()
@@ -71,6 +75,11 @@ def plain(value: Any, arrays: bool = False) -> Any:
 
 def check_positive(name: str, value: Any, remedy: str = "") -> None:
     """
+    Check that a value is a finite number above 0.
+
+    :param name: name of the value, for the message
+    :param value: value to check
+    :param remedy: advice that the message adds to what is allowed
     :raises ValueError: unless ``value`` is a finite number > 0
     """
     _check_number(name, value, 0 < _number(value) < math.inf, "> 0", remedy)
@@ -78,6 +87,11 @@ def check_positive(name: str, value: Any, remedy: str = "") -> None:
 
 def check_not_negative(name: str, value: Any, remedy: str = "") -> None:
     """
+    Check that a value is a finite number of 0 or more.
+
+    :param name: name of the value, for the message
+    :param value: value to check
+    :param remedy: advice that the message adds to what is allowed
     :raises ValueError: unless ``value`` is a finite number >= 0
     """
     _check_number(name, value, 0 <= _number(value) < math.inf, ">= 0", remedy)
@@ -85,6 +99,10 @@ def check_not_negative(name: str, value: Any, remedy: str = "") -> None:
 
 def check_fraction(name: str, value: Any) -> None:
     """
+    Check that a value is a number from 0 to 1, both allowed.
+
+    :param name: name of the value, for the message
+    :param value: value to check
     :raises ValueError: unless ``value`` is a number in [0, 1]
     """
     _check_number(name, value, 0 <= _number(value) <= 1, "from 0 to 1")
@@ -92,7 +110,11 @@ def check_fraction(name: str, value: Any) -> None:
 
 def check_inner_fraction(name: str, value: Any) -> None:
     """
-    :raises ValueError: unless ``value`` is a number between 0 and 1, and neither
+    Check that a value is a number between 0 and 1, neither allowed.
+
+    :param name: name of the value, for the message
+    :param value: value to check
+    :raises ValueError: unless ``value`` is a number in (0, 1)
     """
     if not 0 < _number(value) < 1:
         raise ValueError(f"{name} must be a number between 0 and 1, got {value!r}.")
@@ -112,7 +134,14 @@ def _check_number(name: str, value: Any, allowed: bool, bound: str, remedy: str 
 
 def check_integer(name: str, value: Any, low: int, high: float = math.inf, remedy: str = "") -> None:
     """
-    :raises ValueError: unless ``value`` is a whole number from ``low`` to ``high``
+    Check that a value is an integer in a range.
+
+    :param name: name of the value, for the message
+    :param value: value to check
+    :param low: smallest allowed value
+    :param high: largest allowed value
+    :param remedy: advice that the message adds to what is allowed
+    :raises ValueError: unless ``value`` is an integer from ``low`` to ``high``
     """
     if not (isinstance(value, Integral) and low <= int(value) <= high):
         bound = f">= {low}" if high == math.inf else f"from {low} to {high}"
@@ -121,6 +150,12 @@ def check_integer(name: str, value: Any, low: int, high: float = math.inf, remed
 
 def check_range(name: str, value: Any, above: float = -math.inf) -> tuple[float, float]:
     """
+    Check that a value is a pair of bounds.
+
+    :param name: name of the value, for the message
+    :param value: value to check
+    :param above: number below both bounds
+    :return: lower and upper bound
     :raises ValueError: unless ``value`` is a pair of numbers with ``above`` < low < high
     """
     try:
@@ -135,6 +170,11 @@ def check_range(name: str, value: Any, above: float = -math.inf) -> tuple[float,
 
 def check_choice(name: str, value: Any, choices: Any) -> None:
     """
+    Check that a value is one of several.
+
+    :param name: name of the value, for the message
+    :param value: value to check
+    :param choices: allowed values
     :raises ValueError: unless ``value`` is one of ``choices``
     """
     if value not in tuple(choices):
@@ -143,7 +183,13 @@ def check_choice(name: str, value: Any, choices: Any) -> None:
 
 def check_type(name: str, value: Any, types: type | tuple[type, ...], expected: str) -> None:
     """
-    :raises ValueError: unless ``value`` is an instance of ``types``; the message says what is ``expected``
+    Check the type of a value.
+
+    :param name: name of the value, for the message
+    :param value: value to check
+    :param types: allowed type, or types
+    :param expected: description of what is allowed, for the message
+    :raises ValueError: unless ``value`` is an instance of ``types``
     """
     if not isinstance(value, types):
         raise ValueError(f"{name} must be {expected}, got {value!r}.")
@@ -151,7 +197,13 @@ def check_type(name: str, value: Any, types: type | tuple[type, ...], expected: 
 
 def check_schedule(name: str, value: Any, remedy: str = "or a schedule", may_be_zero: bool = False) -> None:
     """
-    :raises ValueError: unless ``value`` is a number > 0, or >= 0, or a schedule, which may begin or end at zero
+    Check that a value is a positive number or a schedule of such; a schedule may begin or end at 0.
+
+    :param name: name of the value, for the message
+    :param value: number, function of the fraction of training that remains, or text of a schedule
+    :param remedy: advice that the message adds to what is allowed
+    :param may_be_zero: whether the number 0 is allowed as well
+    :raises ValueError: unless ``value`` is one of these
     """
     if isinstance(value, str):
         try:
@@ -170,10 +222,10 @@ def check_schedule(name: str, value: Any, remedy: str = "or a schedule", may_be_
 
 def check_box_actions(space: spaces.Box) -> None:
     """
-    Actions are made in [-1, 1] and scaled to the space's bounds, and back for the replay buffer.
+    Check that actions can be scaled from [-1, 1], where policies make them, to a space's bounds, and back.
 
-    :param space: of actions
-    :raises UnsupportedActionSpaceError: naming the components that this can't be done in, and what to do about them
+    :param space: space of the actions
+    :raises UnsupportedActionSpaceError: naming the components whose bounds do not allow that, and the remedy
     """
     if space.dtype not in (np.float32, np.float64):
         raise UnsupportedActionSpaceError(
@@ -195,7 +247,7 @@ def check_box_actions(space: spaces.Box) -> None:
 
 
 def _box_faults(space: spaces.Box) -> list[tuple[np.ndarray, Callable[[Any, Any], str]]]:
-    """Where the bounds are at fault, in the space's shape, and what to say of it."""
+    """For each kind of fault: mask of the components that have it, in the space's shape, and function that describes it."""
     low, high = np.asarray(space.low, dtype=np.float64), np.asarray(space.high, dtype=np.float64)
     largest = np.finfo(np.float32).max
     bounded = (np.abs(low) < largest) & (np.abs(high) < largest)
@@ -219,8 +271,9 @@ def _box_faults(space: spaces.Box) -> list[tuple[np.ndarray, Callable[[Any, Any]
 
 def _listed(indices: np.ndarray, most: int = 8) -> str:
     """
-    :param indices: of components, shape (n, dimensions of the space)
-    :param most: named one by one
+    :param indices: indices of components, shape (n, number of the space's dimensions)
+    :param most: number of components that are named one by one, at most
+    :return: list of the components, in words
     """
     names = [str(index[0]) if len(index) == 1 else str(tuple(index)) for index in indices[:most].tolist()]
     return ", ".join(names) + (f" and {len(indices) - most} more" if len(indices) > most else "")
@@ -228,10 +281,12 @@ def _listed(indices: np.ndarray, most: int = 8) -> str:
 
 def check_same_spaces(kind: str, known: spaces.Space, given: spaces.Space, whose: str) -> None:
     """
-    :param kind: "Observation" or "Action"
-    :param known: the model's
-    :param given: another one
-    :param whose: the other one is, for the message
+    Check that a space is the same as the model's.
+
+    :param kind: kind of the spaces, for the message: "Observation" or "Action"
+    :param known: space of the model
+    :param given: space to compare with the model's
+    :param whose: name of what the other space belongs to, for the message, such as "environment"
     :raises ValueError: naming each entry that differs
     """
     if known == given:
@@ -249,7 +304,12 @@ def check_same_spaces(kind: str, known: spaces.Space, given: spaces.Space, whose
 
 
 def index_bounds(space: spaces.Space) -> tuple[Any, Any] | None:
-    """Smallest and largest value of entries that are counted with; ``None`` for those that are measured."""
+    """
+    The smallest and the largest value in a discrete kind of space.
+
+    :param space: space of an entry
+    :return: smallest and largest value, for MultiDiscrete of each component; ``None`` for Box
+    """
     if isinstance(space, spaces.Discrete):
         return space.start, space.start + space.n - 1
     if isinstance(space, spaces.MultiDiscrete):
@@ -259,9 +319,11 @@ def index_bounds(space: spaces.Space) -> tuple[Any, Any] | None:
 
 def fault_of(value: Any, space: spaces.Space) -> str | None:
     """
-    :param value: what one environment returned as an entry of this space
-    :param space: with a shape
-    :return: what is wrong with it, in words; ``None`` if nothing is
+    The fault of a value that an environment returned.
+
+    :param value: value that one environment returned for an entry
+    :param space: space of the entry, which has a shape
+    :return: fault of the value in words, as the rest of a sentence; ``None`` if there is none
     """
     try:
         array = np.asarray(value)
@@ -283,9 +345,11 @@ def fault_of(value: Any, space: spaces.Space) -> str | None:
 
 def is_finite(array: np.ndarray, dtype: Any) -> bool:
     """
-    :param array: of numbers
-    :param dtype: in which they will be stored
-    :return: whether all are finite there
+    Whether all numbers are finite once they are stored.
+
+    :param array: array of numbers
+    :param dtype: type in which the numbers will be stored
+    :return: whether all are finite in that type
     """
     if dtype.kind == "f" and array.dtype != dtype:
         with np.errstate(over="ignore"):
@@ -295,9 +359,11 @@ def is_finite(array: np.ndarray, dtype: Any) -> bool:
 
 def held_by(dtype: Any, array: np.ndarray) -> bool:
     """
-    :param dtype: a type of numbers
-    :param array: of another one
-    :return: whether nothing but precision is lost in that type
+    Whether a type can hold numbers of another type.
+
+    :param dtype: type of numbers
+    :param array: array of another type
+    :return: whether the conversion loses no more than precision
     """
     if dtype.kind == "f":
         return is_finite(array, dtype)
@@ -307,7 +373,9 @@ def held_by(dtype: Any, array: np.ndarray) -> bool:
 
 def entries_of(observation: Any) -> Mapping[str, Any]:
     """
-    :param observation: of a Dict space or any other
-    :return: its entries; what is no Dict is one entry, "observation"
+    The entries of an observation.
+
+    :param observation: observation of a Dict space or of any other
+    :return: name -> entry; an observation that is no dict is the one entry "observation"
     """
     return observation if isinstance(observation, Mapping) else {"observation": observation}

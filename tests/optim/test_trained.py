@@ -178,3 +178,10 @@ def test_a_flat_file_that_knows_nothing_yet():
     trained = TrainedParameters(ours, th.optim.Adam(ours, lr=0.1, fused=True))
     group = trained.optimizer.state_dict()["param_groups"][0] | {"params": [0]}
     assert trained.in_present_layout({"state": {}, "param_groups": [group]})["state"] == {}
+
+
+def test_a_gradient_within_its_bound_is_not_multiplied():
+    assert scale_of([th.tensor(0.4)], 0.5) is None
+    assert scale_of([th.tensor(3.0), th.tensor(4.0)], 10.0) is None, "of both together"
+    th.testing.assert_close(scale_of([th.tensor(3.0), th.tensor(4.0)], 2.0), th.tensor(0.4))
+    assert scale_of([th.tensor(float("nan"))], 0.5).isnan(), "what is not finite shows"
