@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import sys
 import textwrap
 from difflib import SequenceMatcher
@@ -105,6 +106,17 @@ def test_four_calls_from_train_to_the_equation(name, loss, monkeypatch):
     registry.make(name, TwoViewBandit()).learn(60)
     way = [called for called in ways[loss] if called != "scheduled"]  # the decorator of minimize: steps wait for a worker
     assert way == ["update", "minimize", loss, "policy_loss"]
+
+
+@pytest.mark.parametrize("folder", ["sb3_gac", "benchmarks", "examples"])
+def test_docstrings_say_what_a_parameter_is(folder):
+    """Not what it is of: ``:param gradients: gradient with respect to each parameter``, not ``of each parameter``."""
+    says_nothing = re.compile(r":(?:param \**\w+|return): (?:of|to|see|likewise)\b.*")
+    found = {
+        str(path.relative_to(PACKAGE.parent)): says_nothing.findall(path.read_text())
+        for path in (PACKAGE.parent / folder).rglob("*.py")
+    }
+    assert found and {path: fields for path, fields in found.items() if fields} == {}
 
 
 @cache
