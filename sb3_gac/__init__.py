@@ -1,12 +1,12 @@
 """
-Guided Actor-Critic for Stable-Baselines3. Importing it registers the ``sb3_gac/*`` environments with gymnasium.
+Guided Actor-Critic for Stable-Baselines3. Importing this package registers the ``sb3_gac/*`` environments with gymnasium.
 
-All else is imported when it is first used: :mod:`sb3_gac.learner` runs on machines that have neither torch nor gymnasium.
+Other modules are imported at their first use, since :mod:`sb3_gac.learner` runs on machines without torch and gymnasium.
 """
 
 from sb3_gac.stopping import take_over
 
-take_over()  # before anything that takes time to import
+take_over()  # before all imports that take time
 
 import warnings
 from importlib import import_module
@@ -71,7 +71,7 @@ _WHERE = {
 }
 
 
-#: Module -> extra that has it, of those that torch looks for when it is imported, and may trip over
+#: Optional module that torch may look for at its import -> extra of this package that installs the module
 _EXTRAS = {"onnx": "export", "onnxruntime": "export"}
 _RENAMED = {"Learner": "OnnxPolicy"}
 

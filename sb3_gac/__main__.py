@@ -1,7 +1,7 @@
 """
 The programs of this package under one name: ``sb3-gac NAME ...``, or ``python -m sb3_gac NAME ...``.
 
-A program is imported when it is called, so that help comes at once.
+A program is imported when it is called, so that the help appears at once.
 """
 
 import argparse
@@ -19,10 +19,10 @@ NAME = "sb3-gac"
 
 class Program(NamedTuple):
     """
-    A program.
+    A program of this package.
 
-    :param module: with ``main``, which reads the process's command line; also run by ``python -m``
-    :param summary: what it does, in a line
+    :param module: name of a module that ``python -m`` runs, whose function ``main`` reads the process's command line
+    :param summary: what the program does, in one line
     """
 
     module: str
@@ -38,15 +38,15 @@ PROGRAMS = {
     "zoo": Program("sb3_gac.zoo", "rl_zoo3 with the algorithms of this package: train, tune, enjoy"),
     "bench": Program("benchmarks", "the benchmarks, in a clone: launch, aggregate, report and others"),
 }
-#: Programs under ``benchmarks`` that users call
+#: Names of the programs under ``benchmarks`` that users call
 BENCHMARKS = ("launch", "aggregate", "report", "headroom", "versus", "speed", "simulators", "theory", "signs", "soak")
 
 
 def main(arguments: list[str] | None = None) -> None:
     """
-    Command line.
+    Run the command line.
 
-    :param arguments: a program's name and its own arguments, by default the process's
+    :param arguments: name of a program and its own arguments; ``None`` for those of the process
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     names, rest = arguments[:1], arguments[1:]
@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
         parser.parse_args(names)
         parser.print_help()
         return
-    # As python -m does: modules of the user's own, which --env may name
+    # Like python -m, so that --env can name modules in the working directory
     sys.path.insert(0, str(Path.cwd()))
     before = sys.argv
     sys.argv = [f"{NAME} {names[0]}", *rest]
@@ -73,14 +73,14 @@ def main(arguments: list[str] | None = None) -> None:
     except ImportError as error:
         if error.name is not None:
             raise
-        sys.exit(str(error))  # of this package: it says what to install
+        sys.exit(str(error))  # an error of this package, which says what to install
     finally:
         sys.argv = before
         sys.path.remove(str(Path.cwd()))
 
 
 def _module(name: str) -> str:
-    """A package's program is its ``__main__``."""
+    """The module of a program; the program of a package is its ``__main__``."""
     module = PROGRAMS[name].module
     return f"{module}.__main__" if name in ("export", "envs") else module
 
@@ -97,7 +97,7 @@ def _bench(arguments: list[str]) -> None:
         return
     if arguments[0] not in BENCHMARKS:
         sys.exit(_unknown(arguments[0], "program", list(BENCHMARKS), "See docs/benchmarks.md."))
-    sys.path.append(str(checkout))  # which some ways of installing a clone leave out
+    sys.path.append(str(checkout))  # some ways of installing a clone leave the path out
     sys.argv = [f"{NAME} bench {arguments[0]}", *arguments[1:]]
     runpy.run_module(f"benchmarks.{arguments[0]}", run_name="__main__")
 

@@ -1,9 +1,9 @@
-"""The algorithms of this package by name, the one table that programs read. Each is imported when it is asked for."""
+"""The algorithms of this package by name, in one table for all programs. A class is imported when it is looked up."""
 
 from importlib import import_module
 from typing import Any
 
-#: Name -> module and class
+#: Name of an algorithm -> ``module:Class``
 ALGORITHMS = {
     "gac": "sb3_gac.gac.gac:GAC",
     "gac_share": "sb3_gac.gac.ablations:GACShare",
@@ -16,7 +16,7 @@ ALGORITHMS = {
     "gpo_clip": "sb3_gac.baselines.gpo:GPOClip",
     "gpo_penalty": "sb3_gac.baselines.gpo:GPOPenalty",
 }
-#: Families of algorithms, by which presets know what they share
+#: Name of a family of algorithms, for which presets have arguments -> ``module:Class`` of their common base
 FAMILIES = {
     "off_policy": "stable_baselines3.common.off_policy_algorithm:OffPolicyAlgorithm",
     "on_policy": "stable_baselines3.common.on_policy_algorithm:OnPolicyAlgorithm",
@@ -27,9 +27,11 @@ _NAMES = {path: name for name, path in {**ALGORITHMS, **FAMILIES}.items()}
 
 def import_path(path: str) -> Any:
     """
-    :param path: ``module:name``, as in ``my_package.algorithms:Mine``
-    :return: what has that name in that module
-    :raises ValueError: if there is no such module, or it has no such name
+    Import an object by its path.
+
+    :param path: path of the form ``module:name``, as in ``my_package.algorithms:Mine``
+    :return: object of that name in the module
+    :raises ValueError: if the path has another form, there is no such module, or the module has no such name
     """
     module, colon, name = path.partition(":")
     if not (module and colon and name):
@@ -44,9 +46,9 @@ def import_path(path: str) -> Any:
 
 def algorithm_class(name: str) -> type:
     """
-    :param name: a key of ``ALGORITHMS``, or ``module:Class``
-    :return: the class
-    :raises ValueError: if there is none of that name
+    :param name: name of the algorithm, a key of ``ALGORITHMS``, or ``module:Class``
+    :return: class of the algorithm
+    :raises ValueError: if there is no class of that name
     """
     if ":" not in name and name not in ALGORITHMS:
         raise ValueError(f"must be one of {sorted(ALGORITHMS)}, or module:Class, got {name!r}.")
@@ -58,8 +60,8 @@ def algorithm_class(name: str) -> type:
 
 def name_of(kind: type) -> str:
     """
-    :param kind: a class
-    :return: its name in ``ALGORITHMS`` or ``FAMILIES``, or else ``module:Class``
+    :param kind: class of an algorithm, or base of a family
+    :return: name of the class in ``ALGORITHMS`` or ``FAMILIES``, or else ``module:Class``
     """
     path = f"{kind.__module__}:{kind.__qualname__}"
     return _NAMES.get(path, path)

@@ -1,12 +1,13 @@
 """
-How robust a trained policy is to its sensors: to noise, to observations that are late, and to observations that are lost::
+Evaluate how robust a trained policy is to its sensors: to noise, to late observations, and to lost observations::
 
     python -m sb3_gac.evaluate runs/HalfCheetah-... --noise 0 0.1 0.2 0.3 --delay 0 1 2 --drop 0 0.1 0.3 --guider
     python -m sb3_gac.evaluate cheetah.zip --env sb3_gac/HalfCheetah-v5 --env-kwargs "{history: 4}" --video worst.mp4
 
-One of the three is varied at a time; all else is as in training, or what a single value says.  Every setting has the same
-seeds: the same first states, and the same noise but for its size.  The learner is given what it reads and nothing else, with
---guider the privileged policy is evaluated beside it.  A table, the curve, and all numbers as JSON are saved.
+One of the three is varied at a time; the other two are as in training, or as their single value says.  Every setting has the
+same seeds: the same first states, and the same noise but for its size.  The learner is given the entries that it reads and
+nothing else; with --guider the privileged policy is evaluated beside it.  A table, the curves, and all numbers as JSON are
+saved.
 """
 
 import argparse
@@ -55,13 +56,16 @@ from sb3_gac.training.environments import STATISTICS
 from sb3_gac.training.provenance import provenance
 
 EVAL_SEED = 10_000
-SIDE_BY_SIDE = 10  # environments: more save little, since they are stepped one after the other
-WIDTHS = (5, 5, 5, 7, 7, 6, 18, 5, 25, 7)  # of the table's columns, before its cells are known
+SIDE_BY_SIDE = 10  # environments: more of them save little, since they are stepped one after the other
+WIDTHS = (5, 5, 5, 7, 7, 6, 18, 5, 25, 7)  # widths of the table's columns, before its cells are known
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """
-    :param arguments: command line, by default the process's
+    Parse the command line.
+
+    :param arguments: command-line arguments, ``None`` for those of the process
+    :return: options; ``asked`` has the values of noise, delay and drop that were given, by name
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
@@ -106,9 +110,12 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
 
 def environment_for(options: argparse.Namespace, file: Path) -> Environment:
     """
-    :param options: of the command line
-    :param file: of the model
-    :raises ValueError: if nothing says which environment is meant
+    Find the environment of the evaluation.
+
+    :param options: options of the command line
+    :param file: file of the model
+    :return: environment that the options name, otherwise that of the model's run, with the options' arguments
+    :raises ValueError: if neither the options nor a run beside the model say which environment is meant
     """
     if options.env is not None:
         return Environment(options.env, options.env_kwargs)
@@ -123,11 +130,13 @@ def environment_for(options: argparse.Namespace, file: Path) -> Environment:
 
 def policies_of(options: argparse.Namespace, file: Path, env: gym.Env) -> tuple[str, dict[str, EvaluatedPolicy]]:
     """
-    :param options: of the command line
-    :param file: of the model
-    :param env: that it is evaluated in
+    Load the policies to evaluate.
+
+    :param options: options of the command line
+    :param file: file of the model
+    :param env: environment in which the model is evaluated
     :return: name of the algorithm, or of the kind of file; and name -> policy
-    :raises ValueError: if it can't be loaded, or has no guider that is to be evaluated
+    :raises ValueError: if the model can't be loaded, or lacks the guider that is to be evaluated
     """
     if file.suffix in EXPORTED:
         if options.guider:
@@ -147,10 +156,10 @@ def policies_of(options: argparse.Namespace, file: Path, env: gym.Env) -> tuple[
 
 class Evaluation:
     """
-    All settings of one command.
+    The evaluation of all settings of one command.
 
-    :param options: of the command line
-    :raises ValueError: or another error that says what is wrong, before any episode is run
+    :param options: options of the command line
+    :raises ValueError: if an option is wrong; all such errors come before the first episode
     """
 
     def __init__(self, options: argparse.Namespace):
@@ -165,7 +174,7 @@ class Evaluation:
             check_fits(policy.entries, env, self.environment.env_id)
         env.close()
         for setting in self.settings:
-            self.environment.make(setting).close()  # what is wrong with a value is said before the first episode
+            self.environment.make(setting).close()  # raises where a value is wrong, before the first episode
         if options.video is not None:
             self._drawable(UNDISTURBED, check=True).close()
         self.directory = options.out or self.file.parent / "evaluation"
@@ -206,13 +215,15 @@ class Evaluation:
 
     @property
     def title(self) -> str:
-        """What is evaluated, and where."""
+        """Algorithm, environment and number of episodes, in words."""
         count = self.options.episodes
         return f"{self.algorithm} on {self.environment.env_id}, {count} episode{'s' * (count > 1)} for each setting"
 
     def save(self, command: str) -> None:
         """
-        :param command: that made the results
+        Write the table, the figure and all numbers to the evaluation's folder.
+
+        :param command: command line that made the results
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         lines = [self._row(*of) for of in self._all()]
@@ -239,8 +250,10 @@ class Evaluation:
 
     def film_worst(self, path: Path) -> str:
         """
-        :param path: of the video
-        :return: what it shows
+        Film the learner's first episode in the setting in which it returned least.
+
+        :param path: file of the video
+        :return: description of the video, in words
         """
         worst = min(self.outcomes, key=lambda setting: self.outcomes[setting]["learner"].mean.mean)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -265,14 +278,14 @@ def _cells(texts: Sequence[str]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """
-    Command line.
+    Run the command line.
 
-    :param arguments: by default the process's
+    :param arguments: command-line arguments, ``None`` for those of the process
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = parse_arguments(arguments)
     if options.video is not None and "DISPLAY" not in os.environ and find_library("EGL") is not None:
-        os.environ.setdefault("MUJOCO_GL", "egl")  # which MuJoCo reads when it is first imported
+        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is first imported
     try:
         evaluation = Evaluation(options)
     except (ValueError, FileNotFoundError, ImportError, RuntimeError, gym.error.Error) as error:
@@ -291,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """A few rows at a time are too little work for several threads, which would wait for each other."""
+    """Limit torch to one thread: for a few rows at a time, several threads would mostly wait for each other."""
     before = th.get_num_threads()
     th.set_num_threads(1)
     try:

@@ -24,7 +24,7 @@ except ImportError as error:
     ) from error
 
 METADATA_KEY = "sb3_gac"
-_READERS = {  # suffix of another kind of file -> what reads it
+_READERS = {  # suffix of another kind of file -> advice on how to read it
     ".pt": 'torch.jit.load("{}") reads TorchScript; for OnnxPolicy, export_learner(model, "<name>.onnx") writes ONNX.',
     ".zip": 'GAC.load("{}") reads a saved model; export_learner(model, "<name>.onnx") then writes ONNX.',
 }
@@ -32,7 +32,7 @@ _READERS = {  # suffix of another kind of file -> what reads it
 
 class OnnxPolicy:
     """
-    A policy that was written by :func:`sb3_gac.deploy.export.export_learner`; it acts deterministically.
+    A policy in an ONNX file of :func:`sb3_gac.deploy.export.export_learner`; it acts deterministically.
 
     :param session: onnxruntime's session of the file
     """
@@ -50,8 +50,11 @@ class OnnxPolicy:
     @classmethod
     def load(cls, path: str | Path) -> "OnnxPolicy":
         """
+        Load the policy in a file.
+
         :param path: file that :func:`sb3_gac.deploy.export.export_learner` wrote
-        :raises FileNotFoundError: if there is none
+        :return: policy in the file, with an empty memory
+        :raises FileNotFoundError: if there is no such file
         :raises ValueError: if it is another file, such as one for TorchScript, or a saved model
         """
         path = Path(path)
@@ -77,11 +80,13 @@ class OnnxPolicy:
 
     def act(self, observation: np.ndarray | Mapping[str, np.ndarray]) -> np.ndarray:
         """
-        :param observation: of the policy's entries, single or batched, as the sensors give it; where there is one, that alone.
-            Images may have their channels last, as cameras give them, or first, as the policy has them
-        :return: action in the environment's range
-        :raises ValueError: if an entry is missing, not one of the policy's, of another shape or type, not finite, or a choice
-            that there is not; if the number of observations changes within an episode
+        Choose the deterministic action for an observation.
+
+        :param observation: entry -> its values as the sensors give them, single or batched; the array alone, if the policy
+            reads one entry. Images may have their channels last, as cameras give them, or first, as the policy has them
+        :return: action in the environment's range; for batched observations, one for each
+        :raises ValueError: if an entry is missing, not one of the policy's, of another shape or type, not finite, or, where it
+            is discrete, out of range; if the number of observations changes within an episode
         """
         inputs, n_rows = self._checked(observation)
         if n_rows is None:
@@ -104,7 +109,7 @@ class OnnxPolicy:
         return self._state
 
     def _checked(self, observation: np.ndarray | Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int | None]:
-        """The policy's entries, and how many of each there are; ``None`` if they are not batched."""
+        """The policy's entries as arrays, and the number of rows in each; ``None`` if they are not batched."""
         if not isinstance(observation, Mapping):
             if len(self._entries) > 1:
                 raise ValueError(f"The policy reads {list(self._entries)}: pass a dict with these entries, not an array.")
@@ -150,11 +155,11 @@ class OnnxPolicy:
 
 def _with_channels_first(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """
-    What SB3's ``predict`` does to an image.
+    Move an image's channels to the front, as SB3's ``predict`` does.
 
-    :param array: one image or several, channels first or last, or something else
-    :param shape: that an image must have, channels first
-    :return: channels first, if it was channels last; otherwise as it was
+    :param array: one image or several, with channels first or last, or anything else
+    :param shape: shape that an image must have, channels first
+    :return: the array with channels first, if they were last; otherwise the array as it was
     """
     is_channels_last = array.shape[-3:] == (*shape[1:], shape[0]) and array.shape[-3:] != shape
     return np.moveaxis(array, -1, -3) if is_channels_last else array

@@ -1,4 +1,4 @@
-"""Modules under the names of earlier versions, for one release: in saved models, checkpoints and users' imports."""
+"""Modules under their names of earlier versions, for one release: saved models, checkpoints and users' imports need them."""
 
 import sys
 import warnings
@@ -8,7 +8,7 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
-#: Former name -> present name
+#: Former name of a module -> present name
 MOVED = {
     f"sb3_gac.{former}": f"sb3_gac.{present}"
     for former, present in {
@@ -55,14 +55,14 @@ PACKAGE = "sb3_gac.common"
 
 
 class MovedModules(MetaPathFinder, Loader):
-    """Finds a module under its former name, and says what its name is now."""
+    """A finder of modules by their former names, which warns and tells the present name."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         """
-        :param fullname: of a module that nobody else has found
-        :param path: of its package
-        :param target: not needed
-        :return: ``None`` unless this is a former name
+        :param fullname: full name of a module that no other finder has found
+        :param path: search path of its package, without effect here
+        :param target: module that is reloaded, without effect here
+        :return: specification of the module; ``None`` unless the name is a former one
         """
         if fullname not in MOVED and fullname != PACKAGE:
             return None
@@ -70,7 +70,9 @@ class MovedModules(MetaPathFinder, Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         """
-        :param module: gets what is in the module of the present name, the same objects
+        Fill a module of a former name.
+
+        :param module: module to fill with the objects of the module of the present name
         """
         if module.__name__ in MOVED:
             present = MOVED[module.__name__]
@@ -80,6 +82,6 @@ class MovedModules(MetaPathFinder, Loader):
 
 
 def find_moved_modules() -> None:
-    """Take former names for present ones from now on."""
+    """Let imports find modules by their former names from now on."""
     if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
         sys.meta_path.append(MovedModules())

@@ -1,4 +1,4 @@
-"""Schedules that are text, so that YAML, presets and saved models can hold them: "geometric 0.05 -> 0.0033 over 0.6"."""
+"""Schedules as text, which YAML, presets and saved models can hold, such as "geometric 0.05 -> 0.0033 over 0.6"."""
 
 import re
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ class NamedSchedule:
     """
     A number that changes over training.
 
-    :param kind: "linear", by equal differences, or "geometric", by equal ratios
-    :param start: at the start
-    :param end: from the fraction ``over`` of training on
-    :param over: from above 0 to 1
+    :param kind: kind of change: "linear", by equal differences, or "geometric", by equal ratios
+    :param start: value at the start of training
+    :param end: value from the fraction ``over`` of training on
+    :param over: fraction of training over which the value changes, above 0 and at most 1
     """
 
     kind: str
@@ -27,7 +27,10 @@ class NamedSchedule:
 
     def __call__(self, progress_remaining: float) -> float:
         """
-        :param progress_remaining: from 1 to 0
+        The value at a point of training.
+
+        :param progress_remaining: remaining fraction of training, from 1 at the start to 0 at the end
+        :return: value of the schedule
         """
         done = min((1.0 - progress_remaining) / self.over, 1.0)
         if done == 1.0:
@@ -39,8 +42,9 @@ class NamedSchedule:
 
 def read_schedule(text: str) -> NamedSchedule:
     """
-    :param text: such as "linear 1.0 -> 0.0", or "geometric 0.05 -> 0.0033 over 0.6"
-    :raises ValueError: if it is no such thing
+    :param text: schedule as text, such as "linear 1.0 -> 0.0" or "geometric 0.05 -> 0.0033 over 0.6"
+    :return: schedule that the text describes
+    :raises ValueError: if the text describes no schedule
     """
     found = _FORM.fullmatch(text.strip())
     if found is None:
@@ -55,7 +59,8 @@ def read_schedule(text: str) -> NamedSchedule:
 
 def as_schedule(value: Any) -> Any:
     """
-    :param value: an argument that may be a schedule
-    :return: the schedule, where it is the text of one; else the value as it is
+    :param value: value of an argument that may be a schedule
+    :return: schedule if the value is a text; else the value itself
+    :raises ValueError: if the value is a text that describes no schedule
     """
     return read_schedule(value) if isinstance(value, str) else value

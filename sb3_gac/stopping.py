@@ -1,9 +1,9 @@
 """
-Ctrl-C ends the main job with one line that says how to go on, and with no traceback, from its first import on.
+Ctrl-C in the main job: from the first import on, it ends the program with one line that says how to go on.
 
-An exception, which Python raises by default, may come in the middle of another library's import, of a destructor or of a
-callback, and be swallowed or be shown as something else there.  This module comes before all others, and imports next to
-nothing.
+By default Python raises an exception, which may come in the middle of another library's import, of a destructor or of a
+callback, where it is swallowed or turned into another error.  This module is imported before all others, and imports
+almost nothing.
 """
 
 import os
@@ -22,8 +22,10 @@ INTERRUPTED = 128 + signal.SIGINT
 
 def started_as(words: Sequence[str]) -> list[str] | None:
     """
-    :param words: of a process's command line, as it was given
-    :return: those that start the main job, without its options; ``None`` if the process is another program
+    The part of a command line that starts the main job.
+
+    :param words: words of a process's command line
+    :return: words that start the main job, without its options; ``None`` if the process is another program
     """
     for number, (word, following) in enumerate(pairwise(words)):
         if (word, following) == ("-m", MODULE):
@@ -35,16 +37,16 @@ def started_as(words: Sequence[str]) -> list[str] | None:
 
 def command(*options: str) -> str:
     """
-    :param options: of the main job
-    :return: what to type for it, in the words with which this process was started
+    :param options: options of the main job
+    :return: command for a shell that starts the main job with these options, in the way in which this process was started
     """
     return joined([*(started_as(sys.orig_argv) or ["python", "-m", MODULE]), *options])
 
 
 def joined(words: Sequence[str]) -> str:
     """
-    :param words: of a command
-    :return: the command, as a shell takes it
+    :param words: words of a command
+    :return: the command as text for a shell
     """
     import shlex
 
@@ -60,29 +62,31 @@ _last_words: Callable[[], str] = _before_anything_was_written
 
 def when_stopped_say(last_words: Callable[[], str]) -> None:
     """
-    :param last_words: returns what is to be said from now on if the program is stopped
+    Set the message for Ctrl-C.
+
+    :param last_words: function that returns the message, in one line
     """
     global _last_words
     _last_words = last_words
 
 
 def last_words() -> str:
-    """How to go on, in one line."""
+    """The message for Ctrl-C, one line that says how to go on."""
     return _last_words()
 
 
 def end_at_once(number: int, frame: "FrameType | None") -> None:
-    """The handler of Ctrl-C: nothing else of the program runs after it, in whatever library it was."""
+    """Handle Ctrl-C: print the message and end the process at once, so that no other code of the program runs."""
     signal.signal(number, signal.SIG_IGN)
     try:  # noqa: SIM105  # contextlib is not imported yet
         sys.stdout.flush()
-    except (OSError, RuntimeError):  # it is being flushed
+    except (OSError, RuntimeError):  # the stream is being flushed already
         pass
     os.write(2, f"\n{last_words()}\n".encode())
     os._exit(128 + number)
 
 
 def take_over() -> None:
-    """In a process that was started for the main job, unless Ctrl-C means something else there."""
+    """Handle Ctrl-C from now on, in a process of the main job that does not handle it otherwise."""
     if started_as(sys.orig_argv) is not None and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, end_at_once)

@@ -6,8 +6,8 @@ Train GAC on a task with noisy sensors, then evaluate the learner on its partial
     python -m sb3_gac.train --env my_module:MyEnv-v0 --env-kwargs "{mass: 2.0}" --algorithm asymmetric_sac
 
 Everything is saved under ``runs/``: the model, the learning curve as a picture, the evaluations and the resolved
-configuration.  A run that was stopped, by Ctrl-C or otherwise, goes on from its last checkpoint, and ends as it would have
-without that::
+configuration.  A run that was stopped, by Ctrl-C or otherwise, can be resumed from its last checkpoint, and then ends with
+the same results as a run that was not stopped::
 
     python -m sb3_gac.train --resume runs/<its directory>
 """
@@ -27,8 +27,11 @@ _TERMINATED = 143
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> Namespace:
     """
-    :param arguments: command line, by default the process's
-    :return: all options, see :func:`sb3_gac.training.options.resolve`, and ``resume``
+    Read the command line.
+
+    :param arguments: words of the command line; ``None`` for those of the process
+    :return: all options, see :func:`sb3_gac.training.options.resolve`, with ``resume``, the directory of a stopped run, or
+        ``None``
     """
     parser = make_parser(__doc__)
     given = given_options(parser, arguments)
@@ -46,9 +49,9 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> Namespace:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """
-    Command line.
+    Run the command line.
 
-    :param arguments: by default the process's
+    :param arguments: words of the command line; ``None`` for those of the process
     """
     options = parse_arguments(arguments)
     try:

@@ -6,8 +6,8 @@ rl_zoo3 with the algorithms of this package::
     python -m sb3_gac.zoo enjoy --algo gac --env sb3_gac/HalfCheetah-v5 --folder logs
     python -m sb3_gac.zoo record_video --algo gac --env sb3_gac/HalfCheetah-v5 --folder logs
 
-Every option is rl_zoo3's, and so are its own algorithms (``--algo ppo``).  Ours, all of :mod:`sb3_gac.algorithms`, have the
-arguments of the preset ``small`` unless ``--conf-file`` names others.
+All options are rl_zoo3's, and rl_zoo3's own algorithms work as well (``--algo ppo``).  The algorithms of this package, all
+of :mod:`sb3_gac.algorithms`, have the arguments of the preset ``small`` unless ``--conf-file`` names a file with others.
 """
 
 import argparse
@@ -40,9 +40,11 @@ _NET_ARCHS = {"small": [128, 128], "medium": [256, 256], "large": [400, 300]}
 
 def hyperparameters(name: str) -> dict[str, dict[str, Any]]:
     """
-    :param name: of an algorithm
-    :return: environment id or "default" -> what rl_zoo3 trains with: the preset's arguments, of which ``role_keys`` are for
-        the registered tasks alone, where the privileged entry is the whole state
+    The hyperparameters of an algorithm in rl_zoo3's form, from the preset ``small``.
+
+    :param name: name of the algorithm
+    :return: environment id or "default" -> hyperparameters; ``role_keys`` are only in those of registered tasks whose
+        privileged entry is the whole state
     """
     preset = read_preset(PRESET)
     arguments: dict[str, Any] = {"n_envs": preset.envs, "n_timesteps": N_TIMESTEPS, "policy": "MultiInputPolicy"}
@@ -57,13 +59,14 @@ def hyperparameters(name: str) -> dict[str, dict[str, Any]]:
 
 def sample(name: str, trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
-    Arguments for one trial of ``-optimize``: those of all algorithms, and those of this one and its ancestors.
+    Sample the arguments for one trial of ``-optimize``: those of all algorithms, and those of the algorithm and its ancestors.
 
-    :param name: of an algorithm
-    :param trial: of Optuna
-    :param n_actions: unused, see rl_zoo3
-    :param n_envs: unused
-    :param additional_args: unused
+    :param name: name of the algorithm
+    :param trial: Optuna's trial
+    :param n_actions: number of actions, an argument of rl_zoo3's samplers that has no effect here
+    :param n_envs: number of environments, without effect here
+    :param additional_args: further arguments of rl_zoo3's samplers, without effect here
+    :return: arguments of the algorithm
     """
     families = {"all", *map(name_of, algorithm_class(name).__mro__)}
     suggested = [suggest(trial) for family, suggest in SUGGESTIONS.items() if family in families]
@@ -97,7 +100,7 @@ def _suggest_on_policy(trial: optuna.Trial) -> dict[str, Any]:
 
 
 def _suggest_distance(trial: optuna.Trial) -> dict[str, Any]:
-    """How far from its teacher the student may be."""
+    """Sample how far the student may be from its teacher."""
     return {
         "target_divergence": trial.suggest_float("target_divergence", 0.05, 10.0, log=True),
         "teacher_coef_learning_rate": trial.suggest_float("teacher_coef_learning_rate", 3e-4, 3e-2, log=True),
@@ -117,7 +120,7 @@ def _suggest_gpo_penalty(trial: optuna.Trial) -> dict[str, Any]:
 
 
 def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
-    """How far the guider may go."""
+    """Sample how far the guider may be from the learner."""
     return {
         **_suggest_entropy(trial),
         "target_kl": trial.suggest_float("target_kl", 3e-4, 0.1, log=True),
@@ -126,7 +129,7 @@ def _suggest_guidance(trial: optuna.Trial) -> dict[str, Any]:
 
 
 def _suggest_bounds(trial: optuna.Trial) -> dict[str, Any]:
-    """How far a step of the policy may go."""
+    """Sample how far a step of the policy may go."""
     return {
         "target_improvement": trial.suggest_float("target_improvement", 0.01, 1.0, log=True),
         "target_kl": trial.suggest_float("target_kl", 1e-3, 0.1, log=True),
@@ -134,7 +137,7 @@ def _suggest_bounds(trial: optuna.Trial) -> dict[str, Any]:
     }
 
 
-#: "all", or a family or an algorithm, with its subclasses -> what it has to sample
+#: "all", or name of a family or algorithm (which covers its subclasses) -> function that samples arguments
 SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {
     "all": _suggest_shared,
     "off_policy": _suggest_off_policy,
@@ -152,7 +155,7 @@ SUGGESTIONS: dict[str, Callable[[optuna.Trial], dict[str, Any]]] = {
 
 def convert(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
-    :param sampled_params: values as a trial stores them
+    :param sampled_params: values in the form in which a trial stores them
     :return: arguments of the algorithm
     """
     arguments = dict(sampled_params)
@@ -170,7 +173,7 @@ def register() -> None:
 
 
 def record_video() -> None:
-    """rl_zoo3's script has no function to call."""
+    """Run rl_zoo3's script, which has no function to call."""
     runpy.run_module("rl_zoo3.record_video", run_name="__main__")
 
 
@@ -179,9 +182,9 @@ SCRIPTS: dict[str, Callable[[], None]] = {"train": train, "enjoy": enjoy, "recor
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """
-    Command line.
+    Run the command line.
 
-    :param arguments: a script's name and its options, by default the process's
+    :param arguments: name of a script and its options; ``None`` for those of the process
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("script", choices=list(SCRIPTS))
@@ -197,9 +200,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def with_hyperparameters(options: list[str], directory: Path) -> list[str]:
     """
-    :param options: of rl_zoo3's ``train``
-    :param directory: for the file of hyperparameters, which rl_zoo3 reads, and writes with the model
-    :return: with ``--conf-file`` added if they name an algorithm of this package and no such file
+    Add a file of hyperparameters to the options, unless they name one.
+
+    :param options: options of rl_zoo3's ``train``
+    :param directory: directory for the file, which rl_zoo3 reads, and saves with the model
+    :return: options with ``--conf-file`` added, if they name an algorithm of this package and no such file
     """
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo")

@@ -1,1 +1,1 @@
-"""The algorithms that GAC is compared with, one small class a file."""
+"""The algorithms that GAC is compared with, each in a file of its own."""

@@ -22,23 +22,30 @@ from sb3_gac.networks.actors import Actor
 from sb3_gac.networks.critics import CriticEnsemble
 from sb3_gac.optim.coefficients import Coefficient, SoftplusDual, make_coefficient
 
-#: Coefficient -> where it starts; and the bounds of all
+#: Start value of each coefficient, by name, and the bounds of all of them
 STARTS = {"temperature": 10.0, "kl_coef": 10.0, "std_kl_coef": 1000.0}
 BOUNDS = (1e-8, 1e6)
-#: What bounds the policy's fit, of the mean (or of the whole policy, where it has no parts) and of the std
+#: Names of the KLs that bound the policy's fit: of the mean (of the whole policy, if actions are discrete), and of the std
 FITS = ("kl", "std_kl")
 
 
 def check_temperature(name: str, value: Any) -> None:
     """
-    :raises ValueError: if it is a number that values can't be divided by; what else it may be is checked where it is made
+    Check the type and sign of a number; :func:`make_coefficient` checks a text.
+
+    :param name: name of the argument
+    :param value: the argument's value
+    :raises ValueError: if the value is neither a text nor a number above 0
     """
     if not isinstance(value, str):
         check_positive(name, value, 'or "auto", "auto_<start value>"')
 
 
 class AsymmetricMPOPolicy(AsymmetricPolicy):
-    """Actor on ``partial``, critics on every entry, a target of each. Arguments are those of :class:`AsymmetricPolicy`."""
+    """
+    An actor on ``partial`` and critics on every entry, each with a target network. Arguments are those of
+    :class:`AsymmetricPolicy`.
+    """
 
     roles = Roles("actor", critics=("critic",), target_policies=("actor",))
     actor: Actor
@@ -48,41 +55,43 @@ class AsymmetricMPOPolicy(AsymmetricPolicy):
 
 
 class AsymmetricMPOGruPolicy(AsymmetricMPOPolicy):
-    """Both networks with a GRU each."""
+    """The policy of :class:`AsymmetricMPOPolicy` with a GRU in each network."""
 
     default_rnn_type = "gru"
 
 
 class AsymmetricMPOLstmPolicy(AsymmetricMPOPolicy):
-    """Both networks with an LSTM each."""
+    """The policy of :class:`AsymmetricMPOPolicy` with an LSTM in each network."""
 
     default_rnn_type = "lstm"
 
 
 class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
     """
-    MPO (Abdolmaleki et al. 2018, arXiv 1806.06920 and 1812.02256) with critics that see everything. The target actor's actions
-    are weighted by exp(Q / temperature), and the actor becomes likelier to take them as they are weighted, within bounds on
-    its KL to the target actor that are held by dual variables: of the mean with the target's std, and of the std with the
-    target's mean, in each action dimension. Of discrete actions all are weighted, and one bound holds the whole policy.
+    MPO (Abdolmaleki et al. 2018, arXiv 1806.06920 and 1812.02256) with critics that see everything. Actions of the target
+    actor get weights in proportion to exp(Q / temperature), and the actor is fitted to the weighted actions by likelihood. Two
+    bounds on KL(target actor || actor) limit the fit in each action dimension, one for the mean (with the target's std) and
+    one for the std (with the target's mean); dual variables hold both. With discrete actions every action gets a weight, and
+    one bound holds the whole policy.
 
-    The actor collects the data: it is the policy that is deployed, it is what all other algorithms here collect with, and the
-    bounds keep it so near its target that it makes little difference. Samples are kept before tanh, and the likelihood is
-    that of the Gaussian there: the density of the action itself differs by a factor that no policy changes, and the KL by
-    nothing. Tanh keeps actions in their range, so they are not penalised for leaving it. States are those of the batch.
+    The actor collects the data, not its target: the actor is deployed, and the bounds keep it so near to its target that the
+    choice makes little difference. Likelihood and KL are those of the Gaussian before tanh: the density of the action itself
+    differs by a factor that no policy changes, and its KL is the same. Actions need no penalty for leaving their range, since
+    tanh keeps them in it. The E-step takes the states of the batch.
 
     Arguments that are not described here are those of :class:`AsymmetricOffPolicyAlgorithm`. There is no entropy term:
-    ``ent_coef`` and ``target_entropy`` are refused. A coefficient is "auto" or "auto_<start value>", which learn it, or a
-    number that stays; a fixed weight of 0 leaves its KL unbounded.
+    ``ent_coef`` and ``target_entropy`` are refused. A coefficient (``temperature``, ``kl_coef``, ``std_kl_coef``) is learned
+    with "auto" or "auto_<start value>", and fixed with a number; a fixed weight of 0 leaves its KL unbounded.
 
-    :param n_actions: samples of each state, for weights and for the critics' targets; of discrete actions all are taken
-    :param temperature: difference of values for which an action counts e times as much; "auto" starts at 10
-    :param target_improvement: KL(weighted actions || target actor) that the temperature is learned for
+    :param n_actions: number of actions sampled in each state, for the weights and for the critics' targets; without effect if
+        actions are discrete
+    :param temperature: difference in Q for which an action's weight is e times as large; "auto" starts at 10
+    :param target_improvement: bound on KL(weighted actions || target actor) that a learned temperature holds
     :param kl_coef: weight of KL(target actor || actor) of the means, or of discrete actions; "auto" starts at 10
-    :param target_kl: bound on it, in each action dimension
-    :param std_kl_coef: weight of that KL of the stds; "auto" starts at 1000
-    :param target_std_kl: bound on it, in each action dimension
-    :param dual_learning_rate: Adam's step size for the temperature and the weights
+    :param target_kl: bound on that KL, in each action dimension
+    :param std_kl_coef: weight of KL(target actor || actor) of the stds; "auto" starts at 1000
+    :param target_std_kl: bound on that KL, in each action dimension
+    :param dual_learning_rate: Adam's step size for the temperature and the two weights
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -128,7 +137,7 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
         super().__init__(policy, env, *sb3, **shared)
 
     def make_coefficients(self) -> dict[str, Coefficient]:
-        """The temperature, and the weights of the KLs, one for each action dimension."""
+        """The temperature, and the weights of the KLs, one number for each action dimension."""
         box = isinstance(self.action_space, spaces.Box)
         shapes = {"temperature": (), "kl_coef": (prod(self.action_space.shape or ()),)}
         shapes |= {"std_kl_coef": shapes["kl_coef"]} if box else {}
@@ -140,14 +149,14 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
         }
 
     def refresh_schedules(self) -> None:
-        """See :meth:`GradientSteps.refresh_schedules`; the duals' rate is what the argument says, whatever a file said."""
+        """Update what follows schedules; the duals' learning rate follows the argument, not the optimiser state of a file."""
         for coefficient in self.coefficients.values():
             if coefficient.optimizer is not None:
                 coefficient.optimizer.param_groups[0]["lr"] = self.dual_learning_rate
         super().refresh_schedules()
 
     def update(self, batch: Batch) -> Metrics:
-        """Policy evaluation, E-step and M-step, and a step of each dual variable."""
+        """One gradient step: policy evaluation, E-step and M-step, and a step of each dual variable."""
         temperature = self.coefficients["temperature"]
         noise = th.randn((2, self.n_actions, *batch.actions.shape), device=self.device)
         (actor,) = self.outputs(batch, "actor")
@@ -163,7 +172,7 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
         return metrics | self.coefficient_values()
 
     def critic_loss(self, batch: Batch, target: Outputs, noise: th.Tensor) -> Loss:
-        """The target actor's return, with the mean over its actions at the next observations."""
+        """The critics fit the target actor's return, with the mean Q over its sampled actions at the next observations."""
         with th.no_grad():
             candidates = target.later.candidates(batch.q_at_next_obs(self.policy.critic_target), noise)
             bellman_target = batch.soft_target(candidates.mean_value)
@@ -178,7 +187,7 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
         noise: th.Tensor,
         temperature: th.Tensor,
     ) -> Loss:
-        """-E_improved log pi of each part of the policy, and its KL from the target actor by its weights."""
+        """For mean and std, the weighted negative log-likelihood of the target actor's actions plus the weighted KL."""
         with th.no_grad():
             candidates = target.now.candidates(batch.q_at_obs(self.policy.critic_target), noise)
             shares, improvement = candidates.improved(temperature)

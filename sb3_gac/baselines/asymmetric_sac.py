@@ -1,4 +1,4 @@
-"""Soft Actor-Critic whose critics see more than its actor: SAC-asym, and with other keys SAC on either view."""
+"""Soft Actor-Critic whose critics see more than its actor: SAC-asym, and with other ``role_keys`` SAC on either view."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -31,13 +31,13 @@ class AsymmetricSACPolicy(AsymmetricPolicy):
 
 
 class AsymmetricSACGruPolicy(AsymmetricSACPolicy):
-    """Both networks with a GRU each."""
+    """The policy of :class:`AsymmetricSACPolicy` with a GRU in each network."""
 
     default_rnn_type = "gru"
 
 
 class AsymmetricSACLstmPolicy(AsymmetricSACPolicy):
-    """Both networks with an LSTM each."""
+    """The policy of :class:`AsymmetricSACPolicy` with an LSTM in each network."""
 
     default_rnn_type = "lstm"
 
@@ -50,8 +50,9 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
     "privileged"]}`` SAC on the full state. Arguments that are not described here are those of
     :class:`AsymmetricOffPolicyAlgorithm`.
 
-    :param critic_groups: groups of the same size that the critics form: each learns from its own minimum, and the actor
-        climbs the mean of the minima. With ``policy_kwargs={"n_critics": 4}`` and 2 groups it has as many critics as GAC
+    :param critic_groups: number of groups of equal size that the critics form: the target of a group's critics is the minimum
+        over that group, and the actor climbs the mean of the groups' minima. With ``policy_kwargs={"n_critics": 4}`` and 2
+        groups there are as many critics as in GAC
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -83,7 +84,7 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
             )
 
     def update(self, batch: Batch) -> Metrics:
-        """SAC's; its critics are eq. 15's with the entropy term, its actor eq. 16's without a guider."""
+        """SAC's gradient step: the critics' loss is eq. 15 with an entropy term, the actor's loss eq. 16 without a guider."""
         beta = self.coefficients["ent_coef"].value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
         (actor,) = self.outputs(batch, "actor")
@@ -93,7 +94,7 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         return metrics | self.coefficient_values()
 
     def critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
-        """The actor's return, with its entropy."""
+        """The critics fit the actor's return and entropy."""
         targets = []
         with th.no_grad():
             for group in self.groups(batch.q_at_next_obs(self.policy.critic_target)):
@@ -103,7 +104,7 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
         return self.bellman_loss("critic", batch, target)
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
-        """Climb the critics, with entropy."""
+        """The actor climbs the critics, with an entropy term."""
         now = actor.now
         groups = self.groups(batch.q_at_obs(self.policy.critic))
         q, log_prob = now.value_and_log_prob(lambda actions: _mean_of_minima([group(actions) for group in groups]), noise)
@@ -113,8 +114,10 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
 
     def groups(self, q_function: Callable[[Any], th.Tensor]) -> list[Callable[[Any], th.Tensor]]:
         r"""
-        :param q_function: actions -> values of N critics, shape (N, \*E)
-        :return: of each group of critics, actions -> their values
+        The critics by groups.
+
+        :param q_function: function from actions to the values of N critics, shape (N, \*E)
+        :return: for each of G groups, the function from actions to the values of its critics, shape (N / G, \*E)
         """
         if self.critic_groups == 1:
             return [q_function]
@@ -127,5 +130,5 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
 
 
 def _mean_of_minima(groups: list[th.Tensor]) -> th.Tensor:
-    """One group is left as it is: its minimum is taken where it counts."""
+    """Mean of the groups' minima; a single group stays as it is, since the policy's loss takes its minimum."""
     return groups[0] if len(groups) == 1 else th.stack([q.amin(dim=0) for q in groups]).mean(dim=0, keepdim=True)

@@ -1,4 +1,4 @@
-"""COSIL: Soft Actor-Critic whose entropy term is the distance to a frozen teacher instead."""
+"""COSIL: Soft Actor-Critic with a penalty on the KL to a frozen teacher in place of the entropy term."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,7 +29,7 @@ TEACHER_COEF_START = 1.0
 
 class COSILPolicy(AsymmetricPolicy):
     """
-    A student and its critics, all on ``partial`` unless ``role_keys`` shows the critics more. Arguments are those of
+    A student and its critics, all on ``partial`` unless ``role_keys`` gives the critics more. Arguments are those of
     :class:`AsymmetricPolicy`.
     """
 
@@ -40,34 +40,34 @@ class COSILPolicy(AsymmetricPolicy):
 
 
 class COSILGruPolicy(COSILPolicy):
-    """Student and critics with a GRU each, on what was seen since the episode's start."""
+    """The policy of :class:`COSILPolicy` with a GRU in each network."""
 
     default_rnn_type = "gru"
 
 
 class COSILLstmPolicy(COSILPolicy):
-    """The same with LSTMs."""
+    """The policy of :class:`COSILPolicy` with an LSTM in each network."""
 
     default_rnn_type = "lstm"
 
 
 class COSIL(AsymmetricOffPolicyAlgorithm):
     """
-    A student earns reward and stays near a teacher that sees everything; how near, a dual variable holds it to (Nguyen et al.
-    2022, arXiv 2211.01991).
+    A student earns reward and stays near to a teacher that sees everything; a dual variable holds the distance between them
+    (Nguyen et al. 2022, arXiv 2211.01991).
 
     The objective is E sum gamma^t (r - teacher_coef D), where D is KL(student || teacher), summed over action dimensions, of
     their action distributions in the same step. There is no entropy term: ``ent_coef`` and ``target_entropy`` are refused.
-    Critics read what the student reads, here and in ``role_keys`` by default. With ``n_steps`` above 1 the D of the steps in
-    between is left out, as SAC leaves out their entropies.
+    By default the critics read the student's entries. With ``n_steps`` above 1 the D of the steps in between is left out, as
+    SAC leaves out their entropies.
 
     Arguments that are not described here are those of :class:`AsymmetricOffPolicyAlgorithm`.
 
-    :param teacher: a model that was trained on the full observation, or the path of a saved one; it stays as it is. ``None``
-        serves to load a student that is not trained further
-    :param target_divergence: D that a learned ``teacher_coef`` holds the student to, in nats: "auto" or a number >= 0, see
-        :func:`sb3_gac.networks.heads.resolve_target_divergence`
-    :param teacher_coef: weight of D: "auto" (learned: it rises while D is above its target), "auto_<start value>" or a number
+    :param teacher: model that was trained on the full observation, or the path of a saved one; the teacher is never trained.
+        ``None`` serves to load a student that is not trained further
+    :param target_divergence: mean D that a learned ``teacher_coef`` holds the student to, in nats: a number >= 0, or "auto",
+        which :func:`sb3_gac.networks.heads.resolve_target_divergence` describes
+    :param teacher_coef: weight of D: "auto" (learned; rises while D is above its target), "auto_<start value>" or a number
     :param teacher_coef_bounds: smallest and largest value of a learned ``teacher_coef``
     :param teacher_coef_learning_rate: Adam's step size for a learned ``teacher_coef``
     """
@@ -115,13 +115,13 @@ class COSIL(AsymmetricOffPolicyAlgorithm):
         self.target_divergence = resolve_target_divergence(self.target_divergence, self.action_space)
 
     def make_coefficients(self) -> dict[str, Coefficient]:
-        """The weight of the divergence, and no temperature."""
+        """The weight of D; there is no entropy temperature."""
         spec, rate = self.teacher_coef, self.teacher_coef_learning_rate
         weight = make_coefficient("teacher_coef", spec, TEACHER_COEF_START, self.teacher_coef_bounds, rate, self.device)
         return {"teacher_coef": weight}
 
     def update(self, batch: Batch) -> Metrics:
-        """The critics, the student, and the weight of the divergence."""
+        """One gradient step: the critics, the student, and the weight of D."""
         weight = self.coefficients["teacher_coef"]
         alpha = weight.value
         noise = th.randn((2, *batch.actions.shape), device=self.device)
@@ -132,7 +132,7 @@ class COSIL(AsymmetricOffPolicyAlgorithm):
         return metrics | self.coefficient_values() | {"teacher_coef_on_bound": weight.at_bound()}
 
     def critic_loss(self, batch: Batch, student: Outputs, noise: th.Tensor, alpha: th.Tensor) -> Loss:
-        """r + gamma (1 - done) (min Q_bar - alpha D), of the student at the next observation."""
+        """The critics fit r + gamma (1 - done) (min Q_bar - alpha D), with Q_bar and D at the next observation."""
         with th.no_grad():
             next_q, _ = student.later.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
             divergence = self.divergence(student.later, batch.next_observations)
@@ -140,7 +140,7 @@ class COSIL(AsymmetricOffPolicyAlgorithm):
         return self.bellman_loss("critic", batch, target)
 
     def actor_loss(self, batch: Batch, student: Outputs, noise: th.Tensor, alpha: th.Tensor) -> Loss:
-        """alpha D - min Q."""
+        """The student minimises alpha D - min Q."""
         now = student.now
         q, _ = now.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
         divergence = self.divergence(now, batch.observations)
@@ -150,8 +150,8 @@ class COSIL(AsymmetricOffPolicyAlgorithm):
 
     def divergence(self, student: Distribution, observations: PyTorchObs) -> th.Tensor:
         r"""
-        :param student: its distributions, shapes (\*E, A)
-        :param observations: full ones of the same steps, (\*E, ...) of each entry
-        :return: D, shape (\*E)
+        :param student: action distributions of the student, shapes (\*E, A)
+        :param observations: full observations of the same steps, (\*E, ...) of each entry
+        :return: D = KL(student || teacher), in nats, shape (\*E)
         """
         return student.kl(self.frozen["teacher"](observations))

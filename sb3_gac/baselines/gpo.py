@@ -1,4 +1,4 @@
-"""Guided Policy Optimization: on-policy; a guider that sees everything acts, and one network is both policies."""
+"""Guided Policy Optimization, on-policy: a guider that sees everything acts, and guider and learner share one network."""
 
 import math
 from abc import abstractmethod
@@ -35,10 +35,11 @@ FIRST_KL_COEF, KL_COEF_FACTOR = 0.1, 1.2
 
 class SharedLearner(Actor):
     """
-    The network of both policies, with nought in place of what the learner does not see, and a one that says so.
+    The network of both policies, with zeros in place of the entries that the learner does not see, and a one as a flag for the
+    learner. The flag's weights are the parameter ``is_learner``.
 
-    :param arguments: of :class:`Actor`
-    :raises ValueError: if it has no hidden layer
+    :param arguments: keyword arguments of :class:`Actor`
+    :raises ValueError: if ``net_arch`` has no hidden layer
     """
 
     def __init__(self, **arguments: Any):
@@ -48,24 +49,24 @@ class SharedLearner(Actor):
         self.is_learner = nn.Parameter(th.zeros(self.net_arch[0]))
 
     def latent(self, obs: PyTorchObs) -> th.Tensor:
-        """See :meth:`RolePolicy.latent`."""
+        """The last hidden layer of the learner, see :meth:`RolePolicy.latent`."""
         return self.latent_net[1:](self.first_layer(obs) + self.is_learner)
 
     def first_layer(self, obs: PyTorchObs) -> th.Tensor:
         r"""
         :param obs: observation with at least the learner's entries, (\*E, ...) of each
-        :return: what they make of the first hidden layer, before its activation, shape (\*E, H)
+        :return: part of the first hidden layer that the learner's entries determine, before the activation, shape (\*E, H)
         """
         return self.latent_net[0](self.extract_features(obs, self.features_extractor))
 
 
 class SharedGuider(RoleModel):
     """
-    The learner's network, and what the entries that the learner does not see add to its first hidden layer.
+    The learner's network, with a term in its first hidden layer for the entries that the learner does not see.
 
-    :param learner: whose network it is
-    :param observation_space: the entries that this role reads
-    :param features_extractor: encoder of those that the learner does not see; ``None`` if it sees all of them
+    :param learner: network that the guider shares with the learner
+    :param observation_space: space of the entries that the guider reads
+    :param features_extractor: encoder of the entries that the learner does not see; ``None`` if it sees all of them
     """
 
     rest_extractor = memory = None
@@ -79,13 +80,13 @@ class SharedGuider(RoleModel):
             features_extractor=features_extractor,
             normalize_images=learner.normalize_images,
         )
-        self._learner = (learner,)  # in a tuple: its parameters are its own
+        self._learner = (learner,)  # in a tuple, so that the learner's parameters do not count as the guider's
         self.privileged: nn.Module | None = None
         if features_extractor is not None:
             self.privileged = nn.Linear(features_extractor.features_dim, learner.net_arch[0], bias=False)
 
     def distribution(self, obs: PyTorchObs) -> Distribution:
-        """See :meth:`RolePolicy.distribution`."""
+        """The guider's action distribution, see :meth:`RolePolicy.distribution`."""
         (learner,) = self._learner
         first = learner.first_layer(obs)
         if self.privileged is not None:
@@ -94,13 +95,13 @@ class SharedGuider(RoleModel):
         return learner.output(learner.latent_net[1:](first))
 
     def remember(self, obs: PyTorchObs, state: Any, episode_start: Any) -> tuple[Distribution, None]:
-        """See :meth:`RolePolicy.remember`."""
+        """The guider's action distribution, and no state, see :meth:`RolePolicy.remember`."""
         return self.distribution(obs), None
 
 
 class GPOPolicy(AsymmetricPolicy):
     """
-    One network for learner and guider, and a value of the state. Arguments are those of :class:`AsymmetricPolicy`.
+    One network for learner and guider, and a state-value network. Arguments are those of :class:`AsymmetricPolicy`.
     """
 
     roles = Roles("learner", actors=("guider",), values=("critic",), collects="guider")
@@ -109,7 +110,7 @@ class GPOPolicy(AsymmetricPolicy):
     critic: StateValue
 
     def make_policy(self, role: str, **arguments: Any) -> Any:
-        """See :meth:`AsymmetricPolicy.make_policy`."""
+        """The network of the learner or of the guider, see :meth:`AsymmetricPolicy.make_policy`."""
         if role == "learner":
             return SharedLearner(**arguments)
         missing = [key for key in self.role_keys["learner"] if key not in self.role_keys["guider"]]
@@ -129,12 +130,12 @@ class GPOPolicy(AsymmetricPolicy):
 
 class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
     """
-    What both forms share: PPO for a guider that sees everything; a learner that imitates it and climbs the same advantages
-    (Li & Xie 2025, "Guided Policy Optimization under Partial Observability"). ``predict`` is the learner.
+    Base of both forms of GPO: PPO trains a guider that sees everything, and a learner imitates the guider and climbs the same
+    advantages (Li & Xie 2025, "Guided Policy Optimization under Partial Observability"). ``predict`` is the learner's.
 
-    In all objectives ``guider`` and ``learner`` are the policies at a minibatch's observations. For observations of different
-    sizes use ``VecNormalize(env, norm_reward=False, clip_obs=5.0)``, as the authors do. Arguments that are not described here
-    are those of :class:`AsymmetricOnPolicyAlgorithm`.
+    In all objectives ``guider`` and ``learner`` are the action distributions at a minibatch's observations. Where the entries
+    differ in magnitude, wrap the environments in ``VecNormalize(env, norm_reward=False, clip_obs=5.0)``, as the authors do.
+    Arguments that are not described here are those of :class:`AsymmetricOnPolicyAlgorithm`.
 
     :param learner_rl_coef: weight of the learner's own PPO objective beside its imitation of the guider
     """
@@ -158,7 +159,7 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
     # --- algorithm ----------------------------------------------------------------------------------------------------
 
     def update(self, batch: Samples) -> Metrics:
-        """One step of all networks; policies share one, so their objectives are one loss."""
+        """One gradient step of all networks with one loss, since the policies share a network."""
         noise = th.randn(*batch.actions.shape, device=self.device)
         weights = {name: coefficient.value for name, coefficient in self.coefficients.items()}
         batch = batch._replace(advantages=self.advantages(batch))
@@ -166,7 +167,7 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
         return metrics | self.coefficient_values()
 
     def loss(self, batch: Samples, noise: th.Tensor, epsilon: th.Tensor, weights: Weights) -> Loss:
-        """All objectives together, with the guider's entropy and the value's mean squared error."""
+        """The sum of all objectives, with the guider's entropy and the mean squared error of the state value."""
         guider, learner = (getattr(self.policy, role).distribution(batch.observations) for role in ("guider", "learner"))
         guider_loss = self.guider_objective(batch, guider, learner.detach(), epsilon, weights)
         learner_loss = self.learner_objective(batch, guider.detach(), learner, epsilon)
@@ -180,16 +181,18 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
     @abstractmethod
     def guider_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor, weights: Weights) -> th.Tensor:
         """
+        The guider's loss.
+
         :param batch: B transitions, with normalised advantages
-        :param guider: with its gradient, shapes (B, A)
-        :param learner: as a constant, shapes (B, A)
-        :param epsilon: how far a ratio may count
-        :param weights: values of the coefficients
-        :return: what the guider minimises, scalar
+        :param guider: action distributions of the guider, with their gradient, shapes (B, A)
+        :param learner: action distributions of the learner, as a constant, shapes (B, A)
+        :param epsilon: PPO's clip range, the largest distance of a clipped ratio from 1, scalar
+        :param weights: name of a coefficient -> its value, scalar
+        :return: loss that the guider minimises, scalar
         """
 
     def learner_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor) -> th.Tensor:
-        """Imitate the guider, and climb its advantages."""
+        """The learner's loss: KL(guider || learner), averaged over action dimensions, and PPO's loss on its advantages."""
         log_ratio = (learner.log_prob(batch.actions) - batch.old_log_prob).clamp(max=LARGEST_LOG_RATIO)
         imitation = guider.kl(learner, "mean").mean()
         return imitation + self.learner_rl_coef * clipped_surrogate(log_ratio, batch.advantages, epsilon)
@@ -197,10 +200,10 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
 
 class GPOClip(GPO):
     """
-    GPO-clip: the guider's ratio to the learner is clipped before PPO's own, and a KL brings it back where it has left the
-    learner's vicinity. Arguments that are not described here are those of :class:`GPO`.
+    GPO-clip: the guider's probability ratio to the learner is clipped before PPO's own ratio is, and a KL term brings the
+    guider back where it has left the clip range. Arguments that are not described here are those of :class:`GPO`.
 
-    :param delta: how far the guider's probability of an action may be from the learner's, as a share of it
+    :param delta: largest relative difference of an action's probability under the guider from the learner's, in (0, 1)
     """
 
     argument_checks: ClassVar[Mapping[str, Any]] = {"delta": check_inner_fraction}
@@ -211,7 +214,7 @@ class GPOClip(GPO):
         super().__init__(policy, env, *sb3, **shared)
 
     def guider_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor, weights: Weights) -> th.Tensor:
-        """PPO whose ratio is clipped near the learner first, and a KL where the guider has left the learner's vicinity."""
+        """PPO's loss with a ratio that is first clipped near the learner, and a KL term where that clipping takes effect."""
         log_prob, log_learner = guider.log_prob(batch.actions), learner.log_prob(batch.actions)
         log_distance = log_prob - log_learner
         nearby = log_distance.clamp(math.log(1 - self.delta), math.log(1 + self.delta))
@@ -224,15 +227,16 @@ class GPOClip(GPO):
 
 class GPOPenalty(GPO):
     """
-    GPO-penalty: PPO for the guider, with a KL to the learner whose weight follows a target. Arguments that are not described
-    here are those of :class:`GPO`.
+    GPO-penalty: PPO for the guider, with a penalty on its KL to the learner whose weight adapts to a target. Arguments that
+    are not described here are those of :class:`GPO`.
 
-    Both policies share a network. The guider's KL moves what they share towards the learner, which moves along; the learner's
-    imitation, of weight 1, moves it back. So a weight above 1 lets both drift: the authors' bound is 10.
+    The policies share a network. The guider's penalty moves the shared parameters, so the learner moves along; only the
+    learner's imitation, of weight 1, moves it back. With a weight above 1 both policies may therefore drift. The authors'
+    bound on the weight is 10.
 
-    :param target_kl: KL(guider || learner), as a mean over action dimensions, above which its weight rises after a rollout,
-        and below which it falls
-    :param largest_kl_coef: bound on that weight
+    :param target_kl: KL(guider || learner), averaged over action dimensions, above which the weight rises after a rollout, and
+        below which it falls
+    :param largest_kl_coef: largest value of that weight
     """
 
     argument_checks: ClassVar[Mapping[str, Any]] = {"target_kl": check_positive, "largest_kl_coef": check_positive}
@@ -251,17 +255,17 @@ class GPOPenalty(GPO):
         super().__init__(policy, env, *sb3, **shared)
 
     def make_coefficients(self) -> dict[str, Coefficient]:
-        """The weight of the KL, nought at the start."""
+        """The weight of the KL, which is 0 at the start."""
         kl_coef = MultiplicativeCoefficient(FIRST_KL_COEF, KL_COEF_FACTOR, self.largest_kl_coef, self.device)
         return {"kl_coef": kl_coef}
 
     def guider_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor, weights: Weights) -> th.Tensor:
-        """PPO, and a KL to the learner."""
+        """PPO's loss plus the weighted KL to the learner."""
         surrogate = clipped_surrogate(guider.log_prob(batch.actions) - batch.old_log_prob, batch.advantages, epsilon)
         return surrogate + weights["kl_coef"] * guider.kl(learner, "mean").mean()
 
     def train(self) -> None:
-        """See :meth:`AsymmetricOnPolicyAlgorithm.train`; then the KL's weight takes a step."""
+        """The gradient steps of :meth:`AsymmetricOnPolicyAlgorithm.train`, and then a step of the KL's weight."""
         super().train()
         above = th.tensor(self._last_metrics["kl"] > self.target_kl, device=self.device)
         self.coefficients["kl_coef"].move(above)  # type: ignore[union-attr]

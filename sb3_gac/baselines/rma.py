@@ -1,4 +1,4 @@
-"""Rapid Motor Adaptation: learn with what is privileged in a few numbers, then estimate these from what has happened."""
+"""Rapid Motor Adaptation: learn with a latent of the privileged entries, then estimate the latent from the history."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -29,12 +29,12 @@ from sb3_gac.replay.histories import check_samples_histories
 
 class RMAPolicy(AsymmetricPolicy):
     """
-    An actor on ``partial`` and a latent z, which its part ``adaptation`` estimates from what it has seen and done; ``expert``,
-    the same layers on the true z, which an encoder makes of all other entries; critics on ``partial`` and z, whose targets
-    have a target of the encoder. Of ``role_keys``, "expert" names what is encoded, "critic" what critics see beside z. Other
-    arguments are those of :class:`AsymmetricPolicy`.
+    The ``actor`` acts on ``partial`` and a latent z, which its part ``adaptation`` estimates from past observations and
+    actions. The ``expert`` has the same layers on the true z, which an encoder computes from all other entries. Critics read
+    ``partial`` and z; target critics have a target encoder. In ``role_keys``, "expert" names the encoded entries, and "critic"
+    the entries that critics read beside z. Other arguments are those of :class:`AsymmetricPolicy`.
 
-    :param history: observation-action pairs that z is estimated from, K
+    :param history: number of observation-action pairs that z is estimated from, K
     :param latent_dim: size of z, L
     :param encoder_net_arch: hidden layer sizes of the encoder
     """
@@ -53,16 +53,16 @@ class RMAPolicy(AsymmetricPolicy):
         super().__init__(*args, **kwargs)
 
     def own_options(self) -> dict[str, Any]:
-        """See :meth:`AsymmetricPolicy.own_options`."""
+        """Constructor arguments of this class alone, see :meth:`AsymmetricPolicy.own_options`."""
         return {name: getattr(self, name) for name in ("history", "latent_dim", "encoder_net_arch")}
 
     @property
     def adaptation(self) -> Adaptation:
-        """What estimates z."""
+        """The module that estimates z, which is the actor's memory."""
         return self.actor.memory  # type: ignore[return-value]
 
     def complete_role_keys(self, role_keys: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-        """See :meth:`AsymmetricPolicy.complete_role_keys`."""
+        """Add the encoded entries to those of expert and critic, see :meth:`AsymmetricPolicy.complete_role_keys`."""
         self.beside = {"expert": role_keys["actor"], "critic": role_keys["critic"]}
         self.encoded = [key for key in role_keys["expert"] if key not in role_keys["actor"]]
         if not self.encoded:
@@ -70,7 +70,7 @@ class RMAPolicy(AsymmetricPolicy):
         return role_keys | {role: tuple(dict.fromkeys([*keys, *self.encoded])) for role, keys in self.beside.items()}
 
     def make_extractor(self, role: str, keys: Sequence[str]) -> BaseFeaturesExtractor:
-        """See :meth:`AsymmetricPolicy.make_extractor`."""
+        """The role's own encoder, joined with that of z for expert and critic, see :meth:`AsymmetricPolicy.make_extractor`."""
         own = super().make_extractor(role, self.beside.get(role, keys))
         if role == "actor":
             return own
@@ -78,7 +78,7 @@ class RMAPolicy(AsymmetricPolicy):
         return JoinedExtractor([own, LatentExtractor(entries, self.encoder_net_arch, self.latent_dim, self.activation_fn)])
 
     def body_arguments(self, role: str, features_dim: int) -> dict[str, Any]:
-        """See :meth:`AsymmetricPolicy.body_arguments`."""
+        """Arguments of a role's network; the actor's has the adaptation, see :meth:`AsymmetricPolicy.body_arguments`."""
         body = super().body_arguments(role, features_dim)
         if role == "actor":
             memory = Adaptation(features_dim, self.action_space, self.history, self.latent_dim, self.activation_fn)
@@ -86,7 +86,7 @@ class RMAPolicy(AsymmetricPolicy):
         return body
 
     def tie_networks(self) -> None:
-        """See :meth:`AsymmetricPolicy.tie_networks`."""
+        """Give the expert the actor's layers and the critics' encoder of z, see :meth:`AsymmetricPolicy.tie_networks`."""
         encoder = self.critic.features_extractor.extractors[-1]  # type: ignore[index]
         self.expert.features_extractor = JoinedExtractor([self.actor.features_extractor, encoder])  # type: ignore[list-item]
         self.expert.latent_net, self.expert.head = self.actor.latent_net, self.actor.head
@@ -94,16 +94,16 @@ class RMAPolicy(AsymmetricPolicy):
 
 class RMA(AsymmetricOffPolicyAlgorithm):
     """
-    Rapid Motor Adaptation (Kumar et al. 2021, arXiv 2107.04034), on SAC. Phase 1: the expert, an actor with the true z,
-    collects data and learns by SAC, the encoder by the losses of actor and critics. Phase 2: all of that stays as it is, the
-    actor collects data with its own estimate of z, and on these alone the estimate is fitted to z.
+    Rapid Motor Adaptation (Kumar et al. 2021, arXiv 2107.04034), on SAC. In phase 1 the expert, an actor with the true z,
+    collects data and learns by SAC; the losses of actor and critics train the encoder of z. In phase 2 these networks are
+    frozen, the actor collects data with its own estimate of z, and the estimate is fitted to z on the data of phase 2 alone.
 
-    ``predict`` is the actor with its estimate, which before phase 2 is an untrained network's; its state is the history.
-    Other arguments are those of :class:`AsymmetricOffPolicyAlgorithm`.
+    ``predict`` is the actor's with its estimate of z, which is untrained before phase 2; the history is the state of
+    ``predict``. Other arguments are those of :class:`AsymmetricOffPolicyAlgorithm`.
 
-    :param history: observation-action pairs that z is estimated from, K
+    :param history: number of observation-action pairs that z is estimated from, K
     :param phase_1_steps: value of ``num_timesteps`` at which phase 2 begins, above ``learning_starts``; ``None`` for half of
-        the steps of the ``learn`` that began to count. One that resets ``num_timesteps`` begins with phase 1 again
+        the steps of the ``learn`` that counts from 0. A ``learn`` that resets ``num_timesteps`` begins with phase 1 again
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": RMAPolicy}
@@ -139,7 +139,7 @@ class RMA(AsymmetricOffPolicyAlgorithm):
         return super()._policy_options() | {"history": self.history}
 
     def choose_acting(self, episode_start: np.ndarray) -> list[str]:
-        """The expert, and from the first step of phase 2 on the actor."""
+        """The policy that acts in each environment: by default the expert in phase 1, and the actor in phase 2."""
         if self._num_timesteps_at_start == 0:
             self.half_of_the_steps = self._total_timesteps // 2
         ends = max(self.half_of_the_steps if self.phase_1_steps is None else self.phase_1_steps, self.learning_starts)
@@ -150,21 +150,21 @@ class RMA(AsymmetricOffPolicyAlgorithm):
         return own if self.behaviour is None else super().choose_acting(episode_start)
 
     def training_state(self) -> dict[str, Any]:
-        """See :meth:`AsymmetricOffPolicyAlgorithm.training_state`."""
+        """State of the training that checkpoints keep, see :meth:`AsymmetricOffPolicyAlgorithm.training_state`."""
         return {"phase": self.phase, "half_of_the_steps": self.half_of_the_steps}
 
     @property
     def history_length(self) -> int:
-        """See :attr:`AsymmetricOffPolicyAlgorithm.history_length`."""
+        """Number of steps in the batches' histories, see :attr:`AsymmetricOffPolicyAlgorithm.history_length`."""
         return self.history if self.phase == 2 else 0
 
     @property
     def at_rest(self) -> frozenset[str]:
-        """See :attr:`AsymmetricOffPolicyAlgorithm.at_rest`."""
+        """The networks that the present phase does not train, see :attr:`AsymmetricOffPolicyAlgorithm.at_rest`."""
         return frozenset(["adaptation"] if self.phase == 1 else self.policy.roles.networks)
 
     def update(self, batch: Batch) -> Metrics:
-        """Phase 1: SAC's, with z in place of what is privileged. Phase 2: the estimate of z."""
+        """One gradient step: in phase 1 SAC's, with z in place of the privileged entries; in phase 2 the adaptation's."""
         if self.phase == 2:
             return self.minimize("adaptation", self.adaptation_loss, batch)
         ent_coef, beta = self.coefficients["ent_coef"], self.coefficients["ent_coef"].value
@@ -175,21 +175,21 @@ class RMA(AsymmetricOffPolicyAlgorithm):
         return metrics | self.coefficient_values()
 
     def critic_loss(self, batch: Batch, noise: th.Tensor, beta: th.Tensor) -> Loss:
-        """The expert's return, with its entropy, by critics and encoder."""
+        """The critics, with their encoder of z, fit the expert's return and entropy."""
         with th.no_grad():
             later: Any = self.policy.expert.distribution(batch.next_observations)
             next_q, log_prob = later.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
         return self.bellman_loss("critic", batch, batch.soft_target(next_q, next_log_prob=log_prob, ent_coef=beta))
 
     def actor_loss(self, batch: Batch, noise: th.Tensor, beta: th.Tensor) -> Loss:
-        """Climb the critics, with entropy, by the actor's layers and the encoder; what the critics see is a constant."""
+        """The actor's layers and the encoder of z climb the critics, with an entropy term; the critics' z is a constant."""
         now: Any = self.policy.expert.distribution(batch.observations)
         q, log_prob = now.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
         entropy = -masked_mean(log_prob, batch.mask)
         return Loss(policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask), {"entropy": entropy})
 
     def adaptation_loss(self, batch: Batch) -> Loss:
-        """Mean squared error of the estimates of z that the actor had."""
+        """Mean squared error of the actor's estimates of z."""
         actor, expert, histories = self.policy.actor, self.policy.expert, batch.histories
         assert histories is not None
         with th.no_grad():

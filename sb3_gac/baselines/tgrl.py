@@ -1,4 +1,4 @@
-"""Teacher-Guided RL: imitate a frozen teacher for as long as that pays off in return."""
+"""Teacher-Guided RL: an actor imitates a frozen teacher for as long as the imitation raises its return."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -27,8 +27,8 @@ from sb3_gac.optim.coefficients import AdditiveCoefficient, Coefficient
 
 class TGRLPolicy(AsymmetricPolicy):
     """
-    Main and auxiliary actor on ``partial``, a critic of the reward and one of the distance to the teacher; ``predict`` is
-    the main actor. Arguments are those of :class:`AsymmetricPolicy`.
+    A main and an auxiliary actor on ``partial``, critics of the reward, and critics of the KL to the teacher. ``predict`` is
+    the main actor's. Arguments are those of :class:`AsymmetricPolicy`.
     """
 
     roles = Roles("actor", ("auxiliary",), ("reward_critic", "teacher_critic"), unprivileged=("auxiliary",))
@@ -41,40 +41,41 @@ class TGRLPolicy(AsymmetricPolicy):
 
     @property
     def critic(self) -> CriticEnsemble:
-        """SB3's name for the critic of the reward."""
+        """SB3's name for the critics of the reward."""
         return self.reward_critic
 
     @property
     def critic_target(self) -> CriticEnsemble:
-        """Target of :attr:`critic`."""
+        """Target network of :attr:`critic`."""
         return self.reward_critic_target
 
 
 class TGRLGruPolicy(TGRLPolicy):
-    """All networks with a GRU each."""
+    """The policy of :class:`TGRLPolicy` with a GRU in each network."""
 
     default_rnn_type = "gru"
 
 
 class TGRLLstmPolicy(TGRLPolicy):
-    """All networks with an LSTM each."""
+    """The policy of :class:`TGRLPolicy` with an LSTM in each network."""
 
     default_rnn_type = "lstm"
 
 
 class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[override]
     """
-    A main actor earns reward and stays near a teacher that sees everything, an auxiliary one earns reward alone; the weight of
-    the teacher rises while the main actor's episodes are the better ones (Shenfeld et al. 2023, arXiv 2307.03186).
+    A main actor earns reward and stays near to a teacher that sees everything; an auxiliary actor earns reward alone. The
+    teacher's weight rises while the main actor's episodes return more, and falls while they return less (Shenfeld et al. 2023,
+    arXiv 2307.03186).
 
     Arguments that are not described here are those of :class:`AsymmetricOffPolicyAlgorithm`.
 
-    :param teacher: a model that was trained on the full observation, or the path of a saved one; it stays as it is. ``None``
-        serves to load a student that is not trained further
+    :param teacher: model that was trained on the full observation, or the path of a saved one; the teacher is never trained.
+        ``None`` serves to load a student that is not trained further
     :param teacher_coef: weight c of the teacher at the start
-    :param coef_step: by which c moves at each comparison
+    :param coef_step: step by which c rises or falls at each comparison
     :param compare_every: environment steps between two comparisons of the actors' returns
-    :param window: episodes of each actor that are compared, the latest ones
+    :param window: number of each actor's latest episodes that are compared
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -111,14 +112,17 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         super().__init__(policy, env, *sb3, **shared)
 
     def make_coefficients(self) -> dict[str, Coefficient]:
-        """The entropy temperature, and the weight of the teacher."""
+        """The entropy temperature and the weight of the teacher."""
         teacher_coef = AdditiveCoefficient(self.teacher_coef, self.coef_step, (0.0, 1e4), self.device)
         return super().make_coefficients() | {"teacher_coef": teacher_coef}
 
     # --- algorithm ----------------------------------------------------------------------------------------------------
 
     def update(self, batch: Batch) -> Metrics:
-        """Both critics, then both actors; the teacher's weight follows from episodes, see :meth:`compare`."""
+        """
+        One gradient step: the critics, then the actors. The teacher's weight changes outside of gradient steps, see
+        :meth:`compare`.
+        """
         beta, c = self.coefficients["ent_coef"].value, self.coefficients["teacher_coef"].value
         noise = th.randn((4, *batch.actions.shape), device=self.device)
         actor, auxiliary = self.outputs(batch, "actor", "auxiliary")
@@ -130,14 +134,14 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         return metrics | self.coefficient_values()
 
     def reward_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
-        """Q_R: the main actor's return, with its entropy; both actors climb it."""
+        """Q_R fits the main actor's return and entropy; both actors climb it."""
         with th.no_grad():
             next_q, log_prob = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.reward_critic_target), noise)
             target = batch.soft_target(next_q, next_log_prob=log_prob, ent_coef=beta)
         return self.bellman_loss("reward_critic", batch, target)
 
     def teacher_critic_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor) -> Loss:
-        """Q_I: discounted -KL(actor || teacher) from the next observation on, and no reward."""
+        """Q_I fits the discounted sum of -KL(actor || teacher) from the next observation on, without reward."""
         with th.no_grad():
             next_q, _ = actor.later.value_and_log_prob(batch.q_at_next_obs(self.policy.teacher_critic_target), noise)
             kl = actor.later.kl(self.frozen["teacher"](batch.next_observations))
@@ -145,7 +149,7 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         return self.bellman_loss("teacher_critic", batch, target)
 
     def actor_loss(self, batch: Batch, actor: Outputs, noise: th.Tensor, beta: th.Tensor, c: th.Tensor) -> Loss:
-        """beta log pi - min Q_R + c (KL - min Q_I)."""
+        """The main actor minimises beta log pi - min Q_R + c (KL - min Q_I)."""
         now = actor.now
         q, log_prob = now.value_and_log_prob(batch.q_at_obs(self.policy.reward_critic), noise)
         q_teacher, _ = now.value_and_log_prob(batch.q_at_obs(self.policy.teacher_critic), noise)
@@ -156,20 +160,24 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         return Loss(loss + c * imitation, seen)
 
     def auxiliary_loss(self, batch: Batch, auxiliary: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
-        """beta log pi_R - min Q_R."""
+        """The auxiliary actor minimises beta log pi_R - min Q_R."""
         q, log_prob = auxiliary.now.value_and_log_prob(batch.q_at_obs(self.policy.reward_critic), noise)
         return Loss(policy_loss(q=q, log_prob=log_prob, ent_coef=beta, mask=batch.mask), {})
 
     # --- collecting ---------------------------------------------------------------------------------------------------
 
     def choose_acting(self, episode_start: np.ndarray) -> list[str]:
-        """Main and auxiliary actor alternate by episode, in each environment."""
+        """In each environment, main and auxiliary actor alternate by episode, unless ``behaviour`` says otherwise."""
         if self.behaviour is not None:
             return super().choose_acting(episode_start)
         other = {"actor": "auxiliary", "auxiliary": "actor"}
         return [other[role] if starts else role for role, starts in zip(self.acting, episode_start, strict=True)]
 
     def compare(self, difference: float) -> None:
-        """The teacher's weight takes a step: up where the main actor's latest episodes were the better ones."""
+        """
+        Move the teacher's weight by a step: up if the main actor's latest episodes returned more, down if they returned less.
+
+        :param difference: mean return of the main actor's latest episodes, less that of the auxiliary actor's
+        """
         self.coefficients["teacher_coef"].move(np.sign(difference))  # type: ignore[union-attr]
         self.logger.record("rollout/main_minus_auxiliary", difference)

@@ -1,1 +1,1 @@
-"""The deployed policy on its way to the robot."""
+"""The export of the deployed policy for the robot."""

@@ -3,7 +3,7 @@ Write the deployed policy of a trained model to a file for the robot, ONNX or To
 
     python -m sb3_gac.deploy runs/HalfCheetah-... cheetah.onnx --unit partial="rad, rad/s" --unit action="N m"
 
-The file's actions are compared with those of the model before it is written.  docs/deployment.md says how to use it.
+The file's actions are compared with those of the model before the file is written.  docs/deployment.md says how to use it.
 """
 
 import argparse
@@ -20,9 +20,9 @@ from sb3_gac.deploy.verification import ExportError
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """
-    Command line.
+    Run the command line.
 
-    :param arguments: by default the process's
+    :param arguments: command-line arguments, ``None`` for those of the process
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path, help="a run's directory, or a model's zip")

@@ -1,7 +1,7 @@
 """
 The deployed policy as a file for the robot: ONNX or TorchScript, from raw observations to actions in the environment's range.
 
-Nothing but the deployed policy goes into the file: no guider, no critics, and no input for what is privileged.
+Nothing but the deployed policy goes into the file: no guider, no critics, and no input for privileged entries.
 """
 
 import json
@@ -28,9 +28,9 @@ from sb3_gac.version import __version__
 
 ACTION, STATE, NEXT_STATE = "action", "state", "next_state"
 METADATA_KEY = "sb3_gac"
-PASSING_NAME = "sb3_gac::value::"  # of inputs and outputs, until they get their own
-COUNTED = ("smallest", "largest")  # values of what is counted, in the metadata
-ACTION_MEANINGS = {  # whether actions are continuous -> what they are
+PASSING_NAME = "sb3_gac::value::"  # prefix of the names of inputs and outputs, until they get their own
+COUNTED = ("smallest", "largest")  # keys of a discrete entry's bounds in the metadata
+ACTION_MEANINGS = {  # whether actions are continuous -> their meaning
     True: "the deterministic action, between low and high, for the environment's step()",
     False: "number of the most probable action, from 0 to n - 1, for the environment's step()",
 }
@@ -40,8 +40,8 @@ class DeployedModule(nn.Module):
     """
     A policy's deterministic action, normalisation and scaling included.
 
-    :param policy: to deploy
-    :param normalizer: of its observations, ``None`` for none
+    :param policy: policy to deploy
+    :param normalizer: normaliser of the policy's observations, ``None`` for none
     """
 
     low: th.Tensor
@@ -53,7 +53,7 @@ class DeployedModule(nn.Module):
         self.policy = policy
         self.keys = list(policy.observation_space.spaces)
         self.normalised = [key for key in self.keys if normalizer is not None and key in normalizer.mean]
-        for index, key in enumerate(self.normalised):  # buffers' names can't hold all that keys can
+        for index, key in enumerate(self.normalised):  # names of buffers can't have all characters of keys
             assert normalizer is not None
             self.register_buffer(f"mean_{index}", th.as_tensor(normalizer.mean[key], dtype=th.float64))
             std = np.sqrt(normalizer.var[key] + normalizer.epsilon)
@@ -61,24 +61,26 @@ class DeployedModule(nn.Module):
         self.action_name, self.state_name, self.next_state_name = (self._free(name) for name in (ACTION, STATE, NEXT_STATE))
         self.clip_obs = 0.0 if normalizer is None else float(normalizer.clip_obs)
         if isinstance(policy.action_space, spaces.Box):
-            # one-dimensional in any case: what is not, ONNX's exporter computes with in the action's float32
+            # one-dimensional in any case: with bounds of another shape, ONNX's exporter computes in the action's float32
             self.register_buffer("low", th.as_tensor(np.ravel(policy.action_space.low)))
             self.register_buffer("high", th.as_tensor(np.ravel(policy.action_space.high)))
 
     def _free(self, name: str) -> str:
-        """The name, told apart from an entry that is called the same."""
+        """The name, with underscores at its end if an entry has the same."""
         return self._free(f"{name}_") if name in self.keys else name
 
     @property
     def memory(self) -> Memory | None:
-        """Of a policy that has one."""
+        """Memory of the policy, ``None`` if it has none."""
         return self.policy.memory
 
     def forward(self, *inputs: th.Tensor) -> Any:
         """
-        :param inputs: the policy's entries, (B, ...) each; with a memory, also what it remembers, shape (B, S), zeros at an
+        Compute deterministic actions from raw observations.
+
+        :param inputs: entries of the policy, shape (B, ...) each; with a memory, also its state, shape (B, S), zeros at an
             episode's start
-        :return: actions, shape (B, \\*action shape); with a memory, also what it remembers now
+        :return: actions, shape (B, \\*action shape); with a memory, also its next state, shape (B, S)
         """
         obs = {key: self._normalize(key, value) for key, value in zip(self.keys, inputs, strict=False)}
         if self.memory is None:
@@ -113,20 +115,22 @@ def export_learner(
     verify_on: int = 256,
 ) -> Path:
     """
-    Write a model's deployed policy to a file, once its actions there are the model's: see :class:`sb3_gac.learner.OnnxPolicy`
-    for its use.
+    Write a model's deployed policy to a file, after a check that the file's actions are the model's.
 
-    :param model: trained
-    :param path: file to write, with the suffix ".onnx", or ".pt" for TorchScript; folders that are not there are made
-    :param normalizer: what normalises the observations; by default that of the model's ``VecNormalize``, if it has one
-    :param units: entry, or "action" -> unit, kept in the file's metadata
-    :param verify_on: number of observations to compare the file's actions and those of ``predict`` on, see
+    On the robot, :class:`sb3_gac.learner.OnnxPolicy` runs an ONNX file.
+
+    :param model: trained model
+    :param path: file to write, with the suffix ".onnx", or ".pt" for TorchScript; missing folders are made
+    :param normalizer: normaliser of the observations; by default that of the model's ``VecNormalize``, if it has one
+    :param units: name of an entry, or "action" -> its unit, for the file's metadata
+    :param verify_on: number of observations on which the file's actions are compared with those of ``predict``, by
         :func:`sb3_gac.deploy.verification.check_agreement`
-    :return: the path
-    :raises ValueError: if the suffix is another, there is nothing to verify on, a unit is that of something else, or the
-        model learned under a ``VecNormalize`` that it does not have any more
-    :raises ImportError: if a file for ONNX is wanted, and onnx or onnxruntime is not installed
-    :raises ExportError: if the file's actions are not those of ``predict``; nothing is then written
+    :return: path of the file
+    :raises ValueError: if the suffix is another, ``verify_on`` is not above 0, a unit is for an entry that the policy does not
+        read, the model learned under a ``VecNormalize`` that it does not have any more, or a wrapper outside of
+        ``VecNormalize`` changes the observations
+    :raises ImportError: if an ONNX file is wanted, and onnx or onnxruntime is not installed
+    :raises ExportError: if the file's actions are not those of ``predict``; no file is then written
     """
     path = Path(path)
     if path.suffix not in WRITERS:
@@ -167,13 +171,15 @@ def _normalizer_of(model: AsymmetricAlgorithm) -> DeploymentNormalizer | None:
 
 def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> dict[str, Any]:
     """
-    :param module: to export
-    :param algorithm: name of its class
-    :param units: entry, or "action" -> unit
-    :return: what its file says of itself, as JSON holds it: entries and actions with shapes, types, bounds (``None`` where
-        there is none) and units, smallest and largest value of what is counted, and the memory to be carried from one action
+    Describe a module in the metadata of its file.
+
+    :param module: module to export
+    :param algorithm: name of the algorithm's class
+    :param units: name of an entry, or "action" -> its unit
+    :return: metadata of the module's file, as JSON holds it: entries and actions with shapes, types, bounds (``None`` where
+        there is none) and units, smallest and largest value of discrete entries, and the memory to be carried from one action
         to the next (``None`` without one)
-    :raises ValueError: if a unit is that of something else, or a name has a null character
+    :raises ValueError: if a unit is for an entry that the policy does not read, or an entry's name has a null character
     """
     unknown = sorted(set(units) - {*module.keys, module.action_name})
     if unknown:
@@ -194,7 +200,7 @@ def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> d
         return {"name": name, "shape": list(space.shape or ()), "dtype": dtype, "unit": units.get(name), **box}
 
     def of_entry(name: str, space: spaces.Space) -> dict[str, Any]:
-        bounds = index_bounds(space)  # of what is counted, in the space's shape or for all of it
+        bounds = index_bounds(space)  # of a discrete entry, in its shape or for all of it
         if bounds is None:
             return of(name, space)
         return of(name, space) | {what: np.asarray(bound).tolist() for what, bound in zip(COUNTED, bounds, strict=True)}
@@ -224,7 +230,7 @@ def _finite(bounds: np.ndarray) -> list[float | None]:
 
 
 def _example(module: DeployedModule) -> tuple[th.Tensor, ...]:
-    """Two observations, of no importance."""
+    """Two observations to trace the module with; their values do not matter."""
     entries = [computable(value) for value in draw_observations(module.policy, None, 2).values()]
     state = [] if module.memory is None else [np.zeros((2, module.memory.state_size), dtype=np.float32)]
     return tuple(th.as_tensor(value) for value in (*entries, *state))
@@ -240,7 +246,7 @@ def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
     remembers = module.memory is not None
     inputs = [*module.keys, *[module.state_name] * remembers]
     outputs = [module.action_name, *[module.next_state_name] * remembers]
-    # torch takes no number as a name, and does not tell an entry from a parameter of the same name
+    # torch takes no number as a name, and confuses an entry with a parameter of the same name
     names = {f"{PASSING_NAME}{index}": name for index, name in enumerate([*inputs, *outputs])}
     passing = list(names)
     th.onnx.export(
@@ -260,8 +266,10 @@ def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
 
 def _rename(graph: Any, names: dict[str, str]) -> None:
     """
-    :param graph: of ONNX, changed in place
-    :param names: of values -> new ones; a value that is called like a new one gets another name
+    Rename values of an ONNX graph.
+
+    :param graph: ONNX graph, changed in place
+    :param names: name of a value -> its new name; another value that has such a name already gets a different one
     """
     values = [*graph.input, *graph.output, *graph.initializer, *graph.value_info]
     known = {value.name for value in values}.union(*(set(node.output) for node in graph.node))

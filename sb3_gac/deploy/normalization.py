@@ -13,12 +13,12 @@ class DeploymentNormalizer:
     """
     Normalise the learner's entries as ``VecNormalize`` did in training: clip((x - mean) / sqrt(var + epsilon)).
 
-    Picklable, and independent of the environment.
+    The normaliser is picklable, and independent of the environment.
 
-    :param mean: entry -> mean
-    :param var: entry -> variance
-    :param epsilon: what ``VecNormalize`` adds to a variance
-    :param clip_obs: bound on normalised values, as in ``VecNormalize``
+    :param mean: entry -> mean, in the shape of the entry
+    :param var: entry -> variance, in the shape of the entry
+    :param epsilon: number that ``VecNormalize`` adds to a variance
+    :param clip_obs: bound on the size of normalised values, as in ``VecNormalize``
     """
 
     def __init__(self, mean: Mapping[str, np.ndarray], var: Mapping[str, np.ndarray], epsilon: float, clip_obs: float):
@@ -29,9 +29,11 @@ class DeploymentNormalizer:
     @classmethod
     def from_vec_normalize(cls, vec_normalize: VecNormalize, keys: Sequence[str] = (PARTIAL,)) -> "DeploymentNormalizer":
         """
+        Make a normaliser of the statistics of ``VecNormalize``.
+
         :param vec_normalize: wrapper of the training environments
         :param keys: entries that the learner reads
-        :return: copy of the wrapper's statistics; entries that it does not normalise pass through unchanged
+        :return: normaliser with a copy of the wrapper's statistics; entries without statistics pass through unchanged
         :raises ValueError: if the wrapper's statistics are not those of a Dict observation
         """
         statistics: Mapping[str, RunningMeanStd] = {}
@@ -48,8 +50,10 @@ class DeploymentNormalizer:
 
     def __call__(self, observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
-        :param observation: raw, single or batched; other entries may be missing or present
-        :return: the same with the learner's entries normalised, float32
+        Normalise an observation.
+
+        :param observation: entry -> raw values, single or batched; entries may be missing, and there may be others
+        :return: the same observation, with the learner's entries normalised, in float32
         """
         return {key: self._normalize(key, value) if key in self.mean else value for key, value in observation.items()}
 

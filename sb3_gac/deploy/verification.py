@@ -1,4 +1,4 @@
-"""Does an exported file act as the policy does? Compared on observations that are drawn, before the file is handed out."""
+"""The check that an exported file acts as the policy does, on random observations, before the file is handed out."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,9 +11,9 @@ from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.networks.actors import DeployedPolicy
 
 TOLERANCE = 1e-5
-SHARE_OF_OUTLIERS = 0.1  # of what is drawn of normalised entries: many are clipped, where that is within
-FARTHEST = 100.0  # standard deviations
-STEPS = 8  # of the sequences that policies with a memory are compared on
+SHARE_OF_OUTLIERS = 0.1  # share of far values in the draw of normalised entries, of which many are clipped
+FARTHEST = 100.0  # standard deviations: where clipping begins farther out than this, far values stay within it
+STEPS = 8  # length of the sequences on which policies with a memory are compared
 Entries = dict[str, np.ndarray]
 
 
@@ -26,14 +26,16 @@ def check_agreement(
     policy: DeployedPolicy, path: Path, normalizer: DeploymentNormalizer | None, n: int, seed: int = 0
 ) -> None:
     """
-    Compare a file's actions with those of ``predict``. Continuous ones may differ by 1e-5 of half their range (or of their
-    value, if that is larger), discrete ones where two logits differ by less than 1e-5.
+    Compare a file's actions with those of ``predict``.
 
-    :param policy: that was exported, on the CPU
-    :param path: of its file
-    :param normalizer: of its observations, ``None`` for none
-    :param n: number of observations; with a memory, of sequences of 8 of them
-    :param seed: of the observations
+    Continuous actions may differ by 1e-5 of half their range, or of their value if that is larger. Discrete actions may differ
+    where two logits differ by less than 1e-5.
+
+    :param policy: exported policy, on the CPU
+    :param path: file of the policy
+    :param normalizer: normaliser of the policy's observations, ``None`` for none
+    :param n: number of observations; for a policy with a memory, number of sequences of 8 observations
+    :param seed: seed of the observations
     :raises ExportError: if the actions differ by more
     """
     act = (_onnx_runner if path.suffix == ".onnx" else _torchscript_runner)(path, policy, n)
@@ -53,12 +55,14 @@ def check_agreement(
 
 def draw_observations(policy: DeployedPolicy, normalizer: DeploymentNormalizer | None, n: int, seed: int = 0) -> Entries:
     """
-    :param policy: whose entries to draw
-    :param normalizer: those that it normalises are drawn from its statistics, all others from their space, without the far
-        ends of wide ones
+    Draw observations of a policy's entries.
+
+    :param policy: policy that reads the entries
+    :param normalizer: normaliser of the policy's observations, ``None`` for none; entries that it normalises are drawn from
+        its statistics, all others from their space, without the far ends of wide ones
     :param n: number of observations, N
-    :param seed: of the draw
-    :return: entry -> shape (N, ...)
+    :param seed: seed of the draw
+    :return: entry -> its raw values, shape (N, ...)
     """
     rng = np.random.default_rng(seed)
     assert isinstance(policy.observation_space, spaces.Dict)
@@ -78,11 +82,13 @@ def draw_observations(policy: DeployedPolicy, normalizer: DeploymentNormalizer |
 
 def _error(policy: DeployedPolicy, seen: Entries, state: tuple[np.ndarray, ...] | None, actions: np.ndarray) -> float:
     """
-    :param policy: that was exported
-    :param seen: normalised observations, (N, ...) each
-    :param state: what the policy remembers, ``None`` at the start
-    :param actions: of the file, shape (N, \\*action shape)
-    :return: the largest difference, in the terms of :func:`check_agreement`
+    Measure how far a file's actions are from those of ``predict``.
+
+    :param policy: exported policy
+    :param seen: entry -> its normalised values, shape (N, ...)
+    :param state: state of the policy's memory, ``None`` at the start
+    :param actions: actions of the file, shape (N, \\*action shape)
+    :return: largest difference, as :func:`check_agreement` measures it
     """
     space = policy.action_space
     if isinstance(space, spaces.Box):

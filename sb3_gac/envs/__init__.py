@@ -1,4 +1,4 @@
-"""Environments and wrappers that return ``partial`` and ``privileged``; importing it registers ``sb3_gac/*``."""
+"""Environments and wrappers that return ``partial`` and ``privileged``; importing this package registers ``sb3_gac/*``."""
 
 import warnings
 from functools import partial
@@ -31,7 +31,7 @@ take_along()
 for _suite in SUITES:
     register(_suite)
 
-#: Name -> module that has it and imports SB3, and with it torch, which the other environments do without
+#: Name -> module that defines it. These modules import SB3, and SB3 imports torch, which the other environments do without
 _VECTOR = {
     "BatchStep": "sb3_gac.envs.vector.base",
     "BatchVecEnv": "sb3_gac.envs.vector.base",
@@ -44,7 +44,7 @@ _FORMER = ("mujoco", "pendulum", "popgym")
 
 
 def __getattr__(name: str) -> Any:
-    """Vectorised environments, when they are first used; and names of earlier versions, for one release."""
+    """Import a vectorised environment when it is first used; names of earlier versions stay for one release."""
     if name in _VECTOR:
         return getattr(import_module(_VECTOR[name]), name)
     if name in _FORMER:

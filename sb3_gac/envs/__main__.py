@@ -1,5 +1,5 @@
 """
-Print the registered environments: shapes, suites, and how to install what is missing; with ``--speed`` steps per second too::
+Print the registered environments with suites, shapes and installation; with ``--speed`` their steps per second too::
 
     python -m sb3_gac.envs
     python -m sb3_gac.envs Go1 --speed --envs 1 16 128
@@ -12,9 +12,9 @@ from sb3_gac.envs.table import Row, in_columns, rows, steps_per_second
 
 def main(arguments: list[str] | None = None) -> None:
     """
-    Command line.
+    Run the command line.
 
-    :param arguments: by default the process's
+    :param arguments: command-line arguments, ``None`` for those of the process
     """
     parser = argparse.ArgumentParser(
         prog="python -m sb3_gac.envs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

@@ -1,4 +1,4 @@
-"""A wrapper of actions."""
+"""A wrapper that changes an environment's action space."""
 
 from typing import Any
 
@@ -11,10 +11,10 @@ from sb3_gac.envs.wrappers import reset_with
 
 class FlattenMultiDiscrete(gym.ActionWrapper):
     """
-    Number the combinations of a MultiDiscrete action, the last component counting fastest.
+    Make a MultiDiscrete action Discrete: its combinations are numbered, and the last component counts fastest.
 
     :param env: environment with MultiDiscrete actions
-    :raises ValueError: if its actions are of another kind
+    :raises ValueError: if the environment's actions are of another kind
     """
 
     def __init__(self, env: gym.Env):
@@ -28,16 +28,16 @@ class FlattenMultiDiscrete(gym.ActionWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
-        :param seed: of the environment
-        :param options: of the environment
+        :param seed: seed of the environment, ``None`` to go on with its random numbers
+        :param options: options of the environment's reset
         :return: observation, info
         """
         return reset_with(self.env, seed, options)
 
     def action(self, action: Any) -> np.ndarray:
         """
-        :param action: number of a combination
-        :return: the combination, as the environment takes it
+        :param action: number of a combination, from 0
+        :return: the combination in the shape and type of the environment's actions
         """
         combination = np.array(np.unravel_index(int(action), self._counts), dtype=self._dtype)
         return combination.reshape(self._shape) + self._start

@@ -1,4 +1,4 @@
-"""What a camera in MuJoCo's simulator sees, in place of an entry of the observation."""
+"""Images of a MuJoCo camera in place of an observation's entry."""
 
 from copy import copy
 from typing import Any
@@ -10,7 +10,7 @@ from gymnasium import spaces
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.wrappers import EntryWrapper
 
-#: Around and along a capsule: fewer than MuJoCo's 28 and 16, which 64 pixels do not show
+#: Facets of a drawn capsule, around it and along it; MuJoCo's own 28 and 16 look the same in images of 64 pixels
 SLICES, STACKS = 12, 6
 HOW_TO_RENDER = (
     "On Linux without a screen: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri, and set the environment variable "
@@ -24,15 +24,15 @@ class NoRenderingError(RuntimeError):
 
 class CameraImage(EntryWrapper):
     """
-    Replace one entry by what a camera sees: uint8, shape (3, size, size).
+    Replace one entry by a camera's image, uint8 of shape (3, size, size).
 
-    Shadows, reflections and smooth edges are left out, which makes drawing in software tens of times faster; the environment's
-    own ``render`` has them as before. Drawing begins with the first reset.
+    The image has no shadows, reflections or smooth edges, which makes drawing in software tens of times faster. The
+    environment's own ``render`` keeps them. Drawing begins with the first reset.
 
     :param env: one of gymnasium's MuJoCo environments, with a Dict observation
-    :param size: pixels of each side
-    :param camera: its name in the model
-    :param key: the entry
+    :param size: height and width of the image, in pixels
+    :param camera: name of the camera in MuJoCo's model
+    :param key: key of the entry that the image replaces
     :raises ValueError: if the environment has no such camera, or ``size`` is not positive
     """
 
@@ -51,14 +51,14 @@ class CameraImage(EntryWrapper):
         self._set_entry_space(spaces.Box(0, 255, (3, size, size), np.uint8))
 
     def close(self) -> None:
-        """Of the camera and of the environment."""
+        """Close the camera's renderer and the environment."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
         super().close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy, in another process for one, draws with a context of its own."""
+        """Leave the renderer out: a copy, such as one in another process, makes its own."""
         return {**vars(self), "_renderer": None}
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
@@ -77,10 +77,12 @@ class CameraImage(EntryWrapper):
 
 def make_renderer(model: Any, size: int) -> Any:
     """
-    :param model: of MuJoCo, which stays as it is
-    :param size: pixels of each side
-    :return: MuJoCo's renderer, with the settings that are fast in software
-    :raises NoRenderingError: saying what to install and to set
+    Make a renderer for a camera's images.
+
+    :param model: MuJoCo's model (``MjModel``); a copy of it is drawn, and the model stays as it is
+    :param size: height and width of the image, in pixels
+    :return: MuJoCo's renderer, with settings that are fast in software
+    :raises NoRenderingError: if MuJoCo can't draw here; the message says what to install and to set
     """
     import mujoco
 
@@ -98,6 +100,9 @@ def make_renderer(model: Any, size: int) -> Any:
 
 def no_rendering(error: Exception) -> NoRenderingError:
     """
-    :param error: MuJoCo's, which depends on what is missing
+    Make the error that says how to enable rendering.
+
+    :param error: error that MuJoCo raised; its type depends on the part of OpenGL that is missing
+    :return: error whose message says how to enable rendering
     """
     return NoRenderingError(f"MuJoCo can't draw images here ({type(error).__name__}: {error}). {HOW_TO_RENDER}")

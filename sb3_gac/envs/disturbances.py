@@ -1,8 +1,8 @@
 """
-What happens to a sensor's signal on its way to the policy: it comes late, or not at all.
+Disturbances of a sensor's signal on its way to the policy: the signal comes late, or not at all.
 
-Together with :class:`~sb3_gac.envs.wrappers.SensorNoise` they compose in the order of a real robot: a value is measured, with
-noise, then sent, and the policy keeps a history of what has arrived::
+The wrappers compose with :class:`~sb3_gac.envs.wrappers.SensorNoise` in the order of a real robot: a value is measured with
+noise, then it is sent, and the policy keeps a history of the values that have arrived::
 
     env = History(DroppedFrames(SensorDelay(SensorNoise(env, 0.1), steps=2), probability=0.1), length=4, actions=True)
 
@@ -20,16 +20,16 @@ from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
 from sb3_gac.envs.wrappers import EntryWrapper, History, PreviousAction, SensorNoise, count_wrappers
 
-FRAME_STREAM = 0x6672616D65  # keeps lost frames apart from generators that others seed with the same number
-#: Wrappers that add to a sensor's value what does not come from the sensor: they stand outside of what disturbs it
+FRAME_STREAM = 0x6672616D65  # separates the losses from generators that others seed with the same number
+#: Wrappers that add values of no sensor to an entry; they stand outside of the sensor's disturbances
 _AFTER_THE_SENSOR = (History, PreviousAction, AppendDesiredGoal)
 
 
 class SensorDelay(EntryWrapper):
     """
-    Show one entry as it was some steps before.
+    Show one entry as it was ``steps`` steps before.
 
-    In an episode's first steps, the first value stands in for those that are not there yet.
+    In an episode's first steps, the first value stands in for earlier ones.
 
     :param env: environment with a Dict observation
     :param steps: number of steps by which the entry is late, 0 for none
@@ -49,20 +49,20 @@ class SensorDelay(EntryWrapper):
         return self._values[0].copy()
 
     def _next(self, value: np.ndarray, action: object, reward: object) -> np.ndarray:
-        self._values.append(value.copy())  # the environment may write into it again
+        self._values.append(value.copy())  # the environment may write into the array again
         return self._values[0].copy()
 
 
 class DroppedFrames(EntryWrapper):
     """
-    Lose each value of one entry with some probability, independently; the last one that arrived is then shown again.
+    Lose each value of one entry with a fixed probability, independently; the last value that arrived is then shown again.
 
-    An episode's first value always arrives. Losses have a generator of their own, seeded by ``reset(seed=...)``: the
-    environment's random numbers and those of the noise are the same whatever ``probability`` is, and what is lost with a
-    small probability is lost with a larger one as well.
+    An episode's first value always arrives. Losses have a random generator of their own, seeded by ``reset(seed=...)``. So the
+    random numbers of the environment and of the noise do not depend on ``probability``, and a value that is lost at a small
+    probability is lost at a larger one as well.
 
     :param env: environment with a Dict observation
-    :param probability: that a value is lost, from 0 to 1
+    :param probability: probability that a value is lost, from 0 to 1
     :param key: the entry whose values are lost; all others stay as they are
     :raises ValueError: if ``probability`` is no number from 0 to 1, or the entry is missing
     """
@@ -73,7 +73,7 @@ class DroppedFrames(EntryWrapper):
         if not is_number or not 0 <= probability <= 1:
             raise ValueError(f"probability must be a number from 0 to 1, with which a value is lost, got {probability!r}.")
         self.probability = float(probability)
-        self._stream = [FRAME_STREAM] * (1 + count_wrappers(env, DroppedFrames))  # apart from losses further in
+        self._stream = [FRAME_STREAM] * (1 + count_wrappers(env, DroppedFrames))  # separate from losses of inner wrappers
         self._generator = np.random.default_rng()
         self._shown = np.empty(0)
 
@@ -91,12 +91,14 @@ class DroppedFrames(EntryWrapper):
 
 def delayed_and_dropped(env: gym.Env, delay: int, drop: float, key: str = PARTIAL) -> gym.Env:
     """
-    :param env: with the entry as it is sent
-    :param delay: steps by which the entry is late; 0 adds no wrapper
-    :param drop: probability that a value of it is lost on the way; 0 adds no wrapper
-    :param key: the entry
-    :return: the environment with the entry as it arrives
-    :raises ValueError: naming the argument that is none of these
+    Make an entry late, and lose some of its values.
+
+    :param env: environment with the entry as the sensor sends it
+    :param delay: number of steps by which the entry is late; 0 adds no wrapper
+    :param drop: probability that a value of the entry is lost on the way; 0 adds no wrapper
+    :param key: key of the entry
+    :return: environment with the entry as it arrives
+    :raises ValueError: if ``delay`` or ``drop`` is out of its range; the message names the argument
     """
     try:
         late = env if delay == 0 else SensorDelay(env, delay, key)
@@ -110,17 +112,19 @@ def delayed_and_dropped(env: gym.Env, delay: int, drop: float, key: str = PARTIA
 
 def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 0.0, key: str = PARTIAL) -> gym.Env:
     """
-    Put wrappers into an environment that has its own already, where the sensor's signal is: beneath every history, previous
-    action and goal, which are the policy's own and need no sensor. For evaluations: the outer wrappers keep the bounds of
-    their spaces, although noise may go beyond them.
+    Disturb the sensor of an environment that has wrappers already.
 
-    :param env: changed in place; must not have been reset yet
+    The new wrappers stand directly around the sensor's signal, beneath every history, previous action and goal: these are the
+    policy's own and need no sensor. The function is for evaluations: the outer wrappers keep the bounds of their spaces,
+    although noisy values may go beyond them.
+
+    :param env: environment in its wrappers, changed in place, which must not have been reset yet
     :param noise_std: standard deviation of noise on top of the environment's own, 0 for none
-    :param delay: steps by which the entry is late
+    :param delay: number of steps by which the entry is late
     :param drop: probability that a value of the entry is lost
-    :param key: the entry
-    :return: the environment, whose outermost layer may be another one
-    :raises ValueError: naming the argument that is wrong
+    :param key: key of the entry
+    :return: the environment, whose outermost layer may be a new wrapper
+    :raises ValueError: if an argument is wrong; the message names it
     """
 
     def wrap(inner: gym.Env) -> gym.Env:
@@ -132,8 +136,10 @@ def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 
 
 def sensor_layer(env: gym.Env) -> gym.Env:
     """
-    :param env: wrapped
-    :return: the outermost of those of its layers whose observation the sensor alone makes
+    Find the layer at which the sensor's signal ends.
+
+    :param env: environment in its wrappers
+    :return: outermost layer whose observation comes from the sensor alone
     """
     outside = [number for number, layer in enumerate(layers(env)) if isinstance(layer, _AFTER_THE_SENSOR)]
     return layers(env)[outside[-1] + 1 if outside else 0]
@@ -141,10 +147,12 @@ def sensor_layer(env: gym.Env) -> gym.Env:
 
 def insert_above(env: gym.Env, layer: gym.Env, wrap: Callable[[gym.Env], gym.Env]) -> gym.Env:
     """
-    :param env: wrapped, changed in place
-    :param layer: one of its layers
-    :param wrap: what is to stand around that layer
-    :return: the environment, whose outermost layer is another one if ``layer`` was the outermost
+    Insert a wrapper between two layers of an environment.
+
+    :param env: environment in its wrappers, changed in place
+    :param layer: layer of the environment that the new wrapper is put around
+    :param wrap: function that returns the layer in the new wrapper
+    :return: the environment, whose outermost layer is the new wrapper if ``layer`` was the outermost
     """
     if layer is env:
         return wrap(env)

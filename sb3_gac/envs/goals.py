@@ -1,4 +1,4 @@
-"""Goal environments: their goals as entries of their own, for hindsight, or as part of ``partial``."""
+"""Goals of goal environments: entries of their own, for hindsight, or parts of ``partial``."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,13 +15,15 @@ ACHIEVED_GOAL, DESIRED_GOAL = GOALS = ("achieved_goal", "desired_goal")
 
 class AppendDesiredGoal(gym.Wrapper):
     """
-    Append ``desired_goal`` to other entries, and drop both goals' own entries: the goal is a command that a policy reads with
-    what it measures.  SB3's ``HerReplayBuffer`` needs those entries as they are: leave this wrapper out for it.
+    Append ``desired_goal`` to other entries, and drop the entries of both goals.
 
-    :param env: environment with a Dict observation that has ``desired_goal``, see ``keep`` of
-        :class:`~sb3_gac.envs.wrappers.SplitDictObservation`
-    :param to: keys of the entries that get the goal, one-dimensional float32
-    :raises ValueError: if ``to`` is no list of keys, or there is no such entry
+    The desired goal is a command, which a policy reads beside its measurements.  SB3's ``HerReplayBuffer`` needs both goals as
+    entries of their own: leave this wrapper out for it.
+
+    :param env: environment with a Dict observation that has ``desired_goal``, which ``keep`` of
+        :class:`~sb3_gac.envs.wrappers.SplitDictObservation` leaves there
+    :param to: keys of the entries that get the goal; these entries are one-dimensional and float32
+    :raises ValueError: if ``to`` is no list of keys, or the observation lacks one of the entries
     """
 
     def __init__(self, env: gym.Env, to: Sequence[str] = (PARTIAL,)):
@@ -37,8 +39,8 @@ class AppendDesiredGoal(gym.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """
-        :param seed: of the environment
-        :param options: of the environment
+        :param seed: seed of the environment, ``None`` to go on with its random numbers
+        :param options: options of the environment's reset
         :return: observation, info
         """
         observation, info = reset_with(self.env, seed, options)
@@ -46,7 +48,7 @@ class AppendDesiredGoal(gym.Wrapper):
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
         """
-        :param action: of the environment
+        :param action: action for the environment
         :return: observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)

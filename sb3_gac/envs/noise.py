@@ -1,20 +1,22 @@
-"""Gaussian noise of sensors: its standard deviation, and the space that a noisy entry has."""
+"""Gaussian noise of sensors: its standard deviation, and the space of a noisy entry."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from gymnasium import spaces
 
-NOISE_STREAM = 0x6E6F697365  # keeps the noise apart from generators that others seed with the same number
+NOISE_STREAM = 0x6E6F697365  # separates the noise from generators that others seed with the same number
 
 
 def check_noise_std(noise_std: float | Sequence[float], entry: spaces.Box, key: str) -> np.ndarray:
     """
-    :param noise_std: standard deviation, a number, or one per component
-    :param entry: that becomes noisy
-    :param key: of the entry
-    :return: shape () or that of the entry, float32
-    :raises ValueError: if ``noise_std`` is negative or of another shape, or the entry is of integers
+    Check the standard deviation of an entry's noise.
+
+    :param noise_std: standard deviation of the noise: a number, or one per component of the entry
+    :param entry: space of the entry that becomes noisy
+    :param key: key of the entry, for the message
+    :return: standard deviation as a float32 array, of shape () or that of the entry
+    :raises ValueError: if ``noise_std`` is negative, not finite or of another shape, or the entry holds integers
     """
     std = np.asarray(noise_std, dtype=np.float32)
     if not (np.isfinite(std).all() and (std >= 0).all()):
@@ -28,9 +30,11 @@ def check_noise_std(noise_std: float | Sequence[float], entry: spaces.Box, key: 
 
 def noisy_box(entry: spaces.Box, noise_std: np.ndarray) -> spaces.Box:
     """
-    :param entry: without noise
-    :param noise_std: of :func:`check_noise_std`
-    :return: the entry with noise, which has no bounds
+    Remove the bounds of those components that become noisy.
+
+    :param entry: space of the entry without noise
+    :param noise_std: standard deviation of the noise, as :func:`check_noise_std` returns it
+    :return: space of the entry with noise; its noisy components have no bounds
     """
     noisy = np.broadcast_to(noise_std, entry.shape) > 0
     low, high = np.where(noisy, -np.inf, entry.low), np.where(noisy, np.inf, entry.high)

@@ -1,4 +1,4 @@
-"""Which components of an observation make an entry: indices of a flat one, keys of a Dict."""
+"""Selections of an observation's components for an entry: indices of a flat observation, keys of a Dict."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,12 +14,12 @@ KeySelection = Sequence[str] | Mapping[str, Indices | None]
 
 class BatchSelection:
     """
-    An entry made of the observations of many environments at once.
+    An entry that is selected from the observations of many environments at once.
 
-    :param name: of the entry, for messages
-    :param selection: of a Box observation, indices into the flattened array, or a slice; of a Dict, keys, or a mapping from
-        keys to such indices, or ``None`` for all of an entry
-    :param space: of one environment's observation: a Box, or a Dict of Boxes
+    :param name: name of the entry, for messages
+    :param selection: selected components: for a Box, indices into the flattened observation, or a slice; for a Dict, keys, or
+        a mapping from keys to such indices, with ``None`` for a whole entry
+    :param space: space of one environment's observation: a Box, or a Dict of Boxes
     :raises ValueError: if the space is of another kind, or a key or an index is unknown
     """
 
@@ -36,8 +36,10 @@ class BatchSelection:
 
     def of(self, observation: Any) -> np.ndarray:
         """
-        :param observation: of N environments, an array, or arrays by key, each of shape (N, ...)
-        :return: shape (N, size of the entry), float32, a new array
+        Take the entry from a batch of observations.
+
+        :param observation: observations of N environments: an array, or arrays by key, each of shape (N, ...)
+        :return: the entry for all N environments, a new float32 array of shape (N, size of the entry)
         """
         rows = [_rows(observation if key is None else observation[key])[:, index] for key, index in self._parts.items()]
         if len(rows) == 1:
@@ -51,8 +53,10 @@ def _rows(values: np.ndarray) -> np.ndarray:
 
 def as_slice(index: np.ndarray | slice) -> np.ndarray | slice:
     """
-    :param index: into an array
-    :return: the same selection, faster where it is a range
+    Turn indices into a slice where they are consecutive.
+
+    :param index: indices into an array, or a slice
+    :return: the same selection, as a slice where the indices are consecutive, since slices are faster
     """
     if isinstance(index, slice):
         return index
@@ -62,11 +66,13 @@ def as_slice(index: np.ndarray | slice) -> np.ndarray | slice:
 
 def check_indices(name: str, indices: Indices, space: spaces.Box) -> np.ndarray:
     """
-    :param name: of the argument
-    :param indices: into the flattened space
-    :param space: that they are into
-    :return: the indices
-    :raises ValueError: if one is outside the space, or there is none
+    Check a selection from a flattened observation.
+
+    :param name: name of the argument, for the message
+    :param indices: indices into the flattened space, or a slice
+    :param space: space of the observation, or of one of its entries
+    :return: the indices as an array, shape (number of indices,)
+    :raises ValueError: if an index is outside the space, or there is none
     """
     size = int(np.prod(space.shape))
     array = np.arange(size)[indices] if isinstance(indices, slice) else np.asarray(list(indices))
@@ -79,10 +85,12 @@ def check_indices(name: str, indices: Indices, space: spaces.Box) -> np.ndarray:
 
 def check_keys(name: str, selection: KeySelection, space: spaces.Dict) -> dict[str, Any]:
     """
-    :param name: of the argument
-    :param selection: keys, or a mapping from keys to indices
-    :param space: that they are of
-    :return: key -> index array, or a slice for the whole entry
+    Check a selection from a Dict observation.
+
+    :param name: name of the argument, for the message
+    :param selection: keys, or a mapping from keys to indices, slices, or ``None`` for a whole entry
+    :param space: space of the Dict observation
+    :return: key -> array of indices, or a slice for the whole entry
     :raises ValueError: if a key or an index is unknown, or there is none
     """
     if isinstance(selection, (str, slice)) or not selection:

@@ -1,4 +1,4 @@
-"""Names of the two entries, and operations on Box spaces."""
+"""Names of the entries ``partial`` and ``privileged``, and operations on Box spaces."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,10 +12,12 @@ PRIVILEGED = "privileged"
 
 def box_entry(space: spaces.Space, key: str) -> spaces.Box:
     """
-    :param space: Dict
-    :param key: of one of its entries
-    :return: that entry's space
-    :raises ValueError: if there is no such entry, or it is not a Box
+    Look up an entry of a Dict space, which must be a Box.
+
+    :param space: Dict space of an observation
+    :param key: key of one of its entries
+    :return: space of that entry
+    :raises ValueError: if there is no such entry, or the entry is not a Box
     """
     if not isinstance(space, spaces.Dict) or key not in space.spaces:
         raise ValueError(f'The observation has no entry "{key}"; its space is {space}.')
@@ -27,9 +29,11 @@ def box_entry(space: spaces.Space, key: str) -> spaces.Box:
 
 def take_from_box(box: spaces.Box, index: Any) -> spaces.Box:
     """
-    :param box: any shape
-    :param index: into the flattened box
-    :return: one-dimensional, float32
+    Select components of a Box.
+
+    :param box: Box of any shape
+    :param index: indices into the flattened Box, or a slice
+    :return: Box of these components, one-dimensional and float32
     """
     low, high = box.low.ravel()[index].astype(np.float32), box.high.ravel()[index].astype(np.float32)
     return spaces.Box(low, high, dtype=np.float32)
@@ -37,8 +41,10 @@ def take_from_box(box: spaces.Box, index: Any) -> spaces.Box:
 
 def concatenate_boxes(boxes: Sequence[spaces.Box]) -> spaces.Box:
     """
-    :param boxes: equal in all axes but the first
-    :return: joined along the first axis
+    Join Boxes along their first axis.
+
+    :param boxes: Boxes that are equal in all axes but the first
+    :return: Box that joins them along the first axis
     """
     low, high = np.concatenate([box.low for box in boxes]), np.concatenate([box.high for box in boxes])
     return spaces.Box(low, high, dtype=boxes[0].dtype)

@@ -1,10 +1,10 @@
 """
-What has to be written down of an environment in the middle of an episode, so that another process goes on from there.
+The state of an environment in the middle of an episode, which is written down so that another process goes on from there.
 
-Known are MuJoCo's and two of classic control's environments, gymnasium's wrappers around registered ones, SB3's ``Monitor``
-and the wrappers of this package.  Any other environment or wrapper takes part by two methods::
+This module knows MuJoCo's environments and two of classic control, gymnasium's wrappers around registered environments, SB3's
+``Monitor``, and the wrappers of this package.  Any other environment or wrapper takes part by two methods::
 
-    def checkpoint_state(self) -> dict[str, Any]          # of numbers, strings, lists, dicts, arrays and generators
+    def checkpoint_state(self) -> dict[str, Any]          # numbers, strings, lists, dicts, arrays and generators
     def restore_checkpoint_state(self, state) -> None
 """
 
@@ -15,10 +15,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-#: Class -> the attributes that change from reset to reset and from step to step
+#: Class -> names of the attributes that a reset or a step changes
 CHANGING: dict[str, tuple[str, ...]] = {
     "gymnasium.wrappers.common.TimeLimit": ("_elapsed_steps",),
-    "rl_zoo3.gym_patches.PatchedTimeLimit": ("_elapsed_steps",),  # in its place, once rl_zoo3 is imported
+    "rl_zoo3.gym_patches.PatchedTimeLimit": ("_elapsed_steps",),  # replaces gymnasium's, once rl_zoo3 is imported
     "gymnasium.wrappers.common.OrderEnforcing": ("_has_reset",),
     "gymnasium.wrappers.common.PassiveEnvChecker": (),
     "gymnasium.wrappers.common.RecordEpisodeStatistics": ("episode_count", "episode_returns", "episode_lengths"),
@@ -49,23 +49,25 @@ CHANGING: dict[str, tuple[str, ...]] = {
     "sb3_gac.envs.suites.robotics.WithSimulatorState": (),
     "sb3_gac.envs.actions.FlattenMultiDiscrete": (),
 }
-#: Set when a state is restored: the checker looks at an episode's first steps, which were before
+#: Flags of gymnasium's checker that are set when a state is restored: an episode's first steps were checked before
 _CHECKED = ("checked_reset", "checked_step", "checked_data_reuse")
-_MUJOCO = "mujoco"  # where the layer's state has this entry, it is of MuJoCo's model and data
-#: Of environments on MuJoCo, beside its state: attributes that a reset draws, and those parts of the model that it may change
+_MUJOCO = "mujoco"  # key of the state of MuJoCo's model and data in a layer's state
+#: Attributes that a reset draws, and prefixes of the arrays in MuJoCo's model that a reset may change
 _DRAWN = ("goal",)
-_ADDRESSES = ("plugin_data",)  # in the memory of one process, of what plugins have for one of MuJoCo's data
+_ADDRESSES = ("plugin_data",)  # memory addresses of plugins' data, which another process can't use
 _PARTS = ("actuator_", "body_", "dof_", "geom_", "jnt_", "site_")
 
 
 class NotRestorableError(ValueError):
-    """An environment, or a wrapper around it, of which it is not known what its state is."""
+    """The state of an environment, or of a wrapper around it, is not known."""
 
 
 def layers(env: gym.Env) -> list[gym.Env]:
     """
-    :param env: wrapped
-    :return: its wrappers from the outermost on, and last the environment itself
+    List the layers of an environment in its wrappers.
+
+    :param env: environment in its wrappers
+    :return: wrappers from the outermost on, and last the environment itself
     """
     found = [env]
     while isinstance(found[-1], gym.Wrapper):
@@ -75,18 +77,22 @@ def layers(env: gym.Env) -> list[gym.Env]:
 
 def env_state(env: gym.Env) -> list[dict[str, Any]]:
     """
-    :param env: wrapped, between two steps
-    :return: state of each of its :func:`layers`, copied
-    :raises NotRestorableError: naming the layer whose state is not known
+    Write down the state of an environment.
+
+    :param env: environment in its wrappers, between two steps
+    :return: copied state of each of its :func:`layers`, with the name of the layer's class
+    :raises NotRestorableError: if the state of a layer is not known; the message names the layer
     """
     return [{"class": _name(layer), **_layer_state(layer)} for layer in layers(env)]
 
 
 def restore_env_state(env: gym.Env, states: list[dict[str, Any]]) -> None:
     """
-    :param env: wrapped in the same layers
-    :param states: of :func:`env_state`
-    :raises NotRestorableError: if the layers are others
+    Put an environment back into a state.
+
+    :param env: environment in the same wrappers, changed in place
+    :param states: state of each layer, as :func:`env_state` returns it
+    :raises NotRestorableError: if the environment has other layers
     """
     names, expected = [_name(layer) for layer in layers(env)], [state["class"] for state in states]
     if names != expected:
@@ -105,7 +111,7 @@ def _layer_state(layer: gym.Env) -> dict[str, Any]:
     elif _is_mujoco(layer):
         state = {_MUJOCO: _mujoco_state(layer)}
     elif _name(layer) in CHANGING:
-        # Some have theirs from the first reset on
+        # Some layers have these attributes only from the first reset on
         there = [attribute for attribute in CHANGING[_name(layer)] if hasattr(layer, attribute)]
         state = {attribute: deepcopy(getattr(layer, attribute)) for attribute in there}
     else:
@@ -140,8 +146,9 @@ def _is_mujoco(layer: gym.Env) -> bool:
 
 def _mujoco_state(layer: Any) -> dict[str, Any]:
     """
-    MuJoCo's own state, from which a step computes the next one, and all that it derived from the state before: observations
-    and rewards of some tasks read positions of bodies, which are those at the last step's start.
+    Copy MuJoCo's own state, from which a step computes the next one, and all quantities that MuJoCo derived from earlier ones.
+
+    Observations and rewards of some tasks read positions of bodies, which MuJoCo computed at the last step's start.
     """
     import mujoco
 
@@ -159,11 +166,11 @@ def _mujoco_state(layer: Any) -> dict[str, Any]:
 def _restore_mujoco(layer: Any, saved: dict[str, Any]) -> None:
     import mujoco
 
-    for name, value in saved.get("drawn", {}).items():  # files of earlier versions have none
+    for name, value in saved.get("drawn", {}).items():  # files of earlier versions have no such entry
         setattr(layer, name, value)
     _write(_arrays(layer.model, _PARTS), saved.get("model", {}))
     mujoco.mj_setState(layer.model, layer.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION)
-    mujoco.mj_forward(layer.model, layer.data)  # as many contacts, and arrays of their sizes, as there were
+    mujoco.mj_forward(layer.model, layer.data)  # makes as many contacts as there were, and arrays of that size
     mujoco.mj_setState(layer.model, layer.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION)
     _write(_arrays(layer.data), saved["derived"])
 
@@ -175,7 +182,7 @@ def _write(arrays: dict[str, np.ndarray], saved: dict[str, np.ndarray]) -> None:
 
 
 def _arrays(struct: Any, prefixes: tuple[str, ...] = ("",)) -> dict[str, np.ndarray]:
-    """Of MuJoCo's model or data: the arrays whose names begin so."""
+    """Arrays of MuJoCo's model or data whose names begin with one of the prefixes, by name."""
     names = [name for name in dir(struct) if name.startswith(prefixes) and not name.startswith(("_", *_ADDRESSES))]
     arrays = {name: getattr(struct, name) for name in names}
     return {name: array for name, array in arrays.items() if isinstance(array, np.ndarray) and array.size}

@@ -1,9 +1,10 @@
 """
-The registered environments in processes that start from nothing, by "spawn" or "forkserver", as vectorised ones do.
+Registration of the environments in the new processes of vectorised ones, which start by "spawn" or "forkserver".
 
-Such a process has ``sb3_gac/*`` only if this package is imported in it.  Where the main module is a script, it is imported
-again and does so; a notebook's or a console's is not, and gymnasium, since its version 1, asks no installed package for its
-environments.  So whatever process is started by one that has this package is described in a way that takes it along.
+Such a process knows ``sb3_gac/*`` only if this package is imported in it.  Where the main module is a script, the new process
+imports that script again, and this package with it.  The main module of a notebook or a console is not imported again, and
+since its version 1 gymnasium asks no installed package for environments.  So this module changes how processes are pickled:
+the pickled description of a process names a function of this module, and to unpickle it imports this package.
 """
 
 from multiprocessing import get_all_start_methods, get_context
@@ -13,7 +14,7 @@ from typing import Any
 
 
 def take_along() -> None:
-    """Processes that are started from now on import this package, and with it register its environments, before they run."""
+    """Have all processes that are started from now on import this package first, and so register its environments."""
     for method in {"spawn", "forkserver"} & set(get_all_start_methods()):
         ForkingPickler.register(get_context(method).Process, _description)  # type: ignore[attr-defined]
 
@@ -23,5 +24,5 @@ def _description(process: BaseProcess) -> tuple[Any, ...]:
 
 
 def _blank(process_class: type[BaseProcess]) -> BaseProcess:
-    """Named in the description, so that the new process imports this module to make sense of it."""
+    """Make an empty process; the description names this function, so the new process imports this module to read it."""
     return process_class.__new__(process_class)

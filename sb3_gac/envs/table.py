@@ -1,4 +1,4 @@
-"""All registered environments in one table: what they show, what they are installed with, how fast they are."""
+"""A table of all registered environments: their shapes, their installation and their speed."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -16,14 +16,14 @@ UNKNOWN = "?"
 
 class Row(NamedTuple):
     """
-    An environment.
+    An environment in the table.
 
-    :param env_id: its id
-    :param suite: that has it
-    :param partial: shape of that entry, such as "48" or "3x64x64"
-    :param privileged: likewise
-    :param actions: number of components, or of choices
-    :param installed: "yes", or how to
+    :param env_id: id of the environment
+    :param suite: name of the suite that has the environment
+    :param partial: shape of the entry ``partial``, such as "48" or "3x64x64"; "?" if it is not known
+    :param privileged: shape of the entry ``privileged``, in the same form
+    :param actions: shape of an action, such as "12", or number of choices, such as "4 choices"; "?" if it is not known
+    :param installed: "yes", or how to install the simulator
     """
 
     env_id: str
@@ -36,8 +36,10 @@ class Row(NamedTuple):
 
 def rows(matching: str = "") -> Iterator[Row]:
     """
-    :param matching: what ids must contain
-    :return: environments, suite by suite; those whose shapes no table has are made, if their simulator is there
+    List the registered environments.
+
+    :param matching: text that ids must contain; the empty text for all environments
+    :return: rows, suite by suite; an environment whose shapes are not recorded is made, if its simulator is installed
     """
     for name, suite in SUITES.items():
         for env_id, arguments in suite.environments.items():
@@ -73,12 +75,14 @@ def _actions_in_words(space: spaces.Space) -> str:
 
 def steps_per_second(env_id: str, n_envs: int, seconds: float = 1.0) -> float:
     """
-    :param env_id: of an environment
-    :param n_envs: side by side
-    :param seconds: to measure for, after a tenth of that to warm up
-    :return: steps of all environments together, with random actions, in a second
+    Measure the speed of an environment.
+
+    :param env_id: id of a registered environment
+    :param n_envs: number of environments side by side
+    :param seconds: duration of the measurement in seconds, after a tenth of it to warm up
+    :return: steps per second of all environments together, with random actions
     """
-    from sb3_gac.envs.vector.registry import make_vec  # imports SB3, and with it torch
+    from sb3_gac.envs.vector.registry import make_vec  # imports SB3, and SB3 imports torch
 
     env = make_vec(env_id, n_envs, seed=0)
     try:
@@ -96,9 +100,11 @@ def steps_per_second(env_id: str, n_envs: int, seconds: float = 1.0) -> float:
 
 def in_columns(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     """
+    Lay out a table with columns of equal width.
+
     :param header: names of the columns
-    :param lines: with as many cells
-    :return: text, as Markdown has tables
+    :param lines: rows, each with as many cells as there are columns
+    :return: table in Markdown
     """
     widths = [max(map(len, column)) for column in zip(header, *lines, strict=True)]
     rule = ["-" * width for width in widths]

@@ -1,7 +1,7 @@
 """
-Wrappers that split an observation into ``partial`` and ``privileged``, and make ``partial`` noisy or give it a memory.
+Wrappers that split an observation into ``partial`` and ``privileged``, and give ``partial`` noise or a history.
 
-Each is a ``gymnasium.Wrapper``, picklable, and passes gymnasium's and SB3's environment checkers.  They compose::
+Each is a picklable ``gymnasium.Wrapper``, and passes the environment checkers of gymnasium and SB3.  The wrappers compose::
 
     env = SplitObservation(gym.make("HalfCheetah-v5"), partial=range(8), privileged=range(17))
     env = History(SensorNoise(env, noise_std=0.1), length=4, actions=True)
@@ -21,11 +21,11 @@ from sb3_gac.envs.selections import KeySelection, as_slice, check_indices, check
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, take_from_box
 
 Observation = dict[str, np.ndarray]
-_NOISE_BLOCK = 128  # drawn at once: one by one takes several times as long
+_NOISE_BLOCK = 128  # samples of the noise that are drawn at once: one by one takes several times as long
 
 
 def reset_with(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
-    """Reset with those keywords that were given: not every environment knows both."""
+    """Reset an environment with those keywords that were given: not every environment takes both."""
     given: dict[str, Any] = {name: value for name, value in {"seed": seed, "options": options}.items() if value is not None}
     return env.reset(**given)
 
@@ -35,9 +35,9 @@ class _SplitWrapper(gym.ObservationWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """
-        :param seed: of the environment
-        :param options: of the environment
-        :return: ``partial`` and ``privileged``, info
+        :param seed: seed of the environment, ``None`` to go on with its random numbers
+        :param options: options of the environment's reset
+        :return: observation with ``partial`` and ``privileged``, info
         """
         observation, info = reset_with(self.env, seed, options)
         return self.observation(observation), info
@@ -48,9 +48,9 @@ class SplitObservation(_SplitWrapper):
     Split a flat Box observation by indices.
 
     :param env: environment with a one-dimensional Box observation
-    :param partial: indices of what the deployed policy will see
-    :param privileged: indices of what only training sees; they may repeat those of ``partial``, where a clean copy
-        of what becomes noisy is wanted
+    :param partial: indices of the components that the deployed policy sees
+    :param privileged: indices of the components that only training sees; they may repeat those of ``partial``, for a clean
+        copy of components that become noisy
     :raises ValueError: if the observation is of another kind, or an index is outside it
     """
 
@@ -68,8 +68,8 @@ class SplitObservation(_SplitWrapper):
 
     def observation(self, observation: np.ndarray) -> Observation:
         """
-        :param observation: of the wrapped environment, shape (D,)
-        :return: ``partial`` and ``privileged``, float32
+        :param observation: observation of the wrapped environment, shape (D,)
+        :return: entries ``partial`` and ``privileged``, float32
         """
         partial, privileged = self._selectors
         observation = observation.astype(np.float32)
@@ -81,9 +81,9 @@ class SplitDictObservation(_SplitWrapper):
     Split a Dict observation, such as that of a goal environment, by keys; entries are flattened and concatenated.
 
     :param env: environment with a flat Dict observation of Box entries
-    :param partial: keys of what the deployed policy will see; as a mapping, key -> indices into the flattened entry,
-        or ``None`` for all of it
-    :param privileged: entries that only training sees, in the same form
+    :param partial: keys of the entries that the deployed policy sees; or a mapping from keys to indices into the flattened
+        entry, with ``None`` for a whole entry
+    :param privileged: keys of the entries that only training sees, in the same form
     :param keep: keys of entries that stay beside the two, with their shapes, such as the goals that ``HerReplayBuffer`` needs
     :raises ValueError: if the observation is of another kind, or a key or an index is unknown
     """
@@ -107,8 +107,8 @@ class SplitDictObservation(_SplitWrapper):
 
     def observation(self, observation: Observation) -> Observation:
         """
-        :param observation: of the wrapped environment
-        :return: ``partial`` and ``privileged``, one-dimensional, float32; and the entries that stay, of floats float32
+        :param observation: observation of the wrapped environment, by key
+        :return: ``partial`` and ``privileged``, one-dimensional and float32; and the kept entries, those of floats in float32
         """
         split = {
             name: np.concatenate([np.ravel(observation[key])[index] for key, index in keys.items()], dtype=np.float32)
@@ -131,8 +131,8 @@ class EntryWrapper(gym.Wrapper, ABC):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """
-        :param seed: of the environment, and of this wrapper's own random numbers, if it has any
-        :param options: of the environment
+        :param seed: seed of the environment's random numbers and of this wrapper's own, ``None`` to go on with them
+        :param options: options of the environment's reset
         :return: changed observation, info
         """
         observation, info = reset_with(self.env, seed, options)
@@ -140,7 +140,7 @@ class EntryWrapper(gym.Wrapper, ABC):
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
         """
-        :param action: of the environment
+        :param action: action for the environment
         :return: changed observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -149,31 +149,31 @@ class EntryWrapper(gym.Wrapper, ABC):
 
     @abstractmethod
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
-        """The entry after a reset."""
+        """Changed entry after a reset."""
 
     @abstractmethod
     def _next(self, value: np.ndarray, action: Any, reward: Any) -> np.ndarray:
-        """The entry after a step."""
+        """Changed entry after a step."""
 
 
 class SensorNoise(EntryWrapper):
     """
     Add independent Gaussian noise N(0, noise_std^2) to one entry, drawn once per reset and per step.
 
-    The noise has a generator of its own, seeded by ``reset(seed=...)``: the environment's random numbers, and with
-    them its dynamics, are the same whatever ``noise_std`` is.
+    The noise has a random generator of its own, seeded by ``reset(seed=...)``. So the environment's random numbers, and with
+    them its dynamics, do not depend on ``noise_std``.
 
     :param env: environment with a Dict observation
-    :param noise_std: standard deviation, in the units of the entry: a number, or one per component
+    :param noise_std: standard deviation of the noise, in the units of the entry: a number, or one per component
     :param key: the entry that becomes noisy
-    :raises ValueError: if ``noise_std`` is negative or of another shape, or the entry is missing or of integers
+    :raises ValueError: if ``noise_std`` is negative, not finite or of another shape, or the entry is missing or holds integers
     """
 
     def __init__(self, env: gym.Env, noise_std: float | Sequence[float], key: str = PARTIAL):
         super().__init__(env, key)
         self.noise_std = check_noise_std(noise_std, self._entry, key)
         self._set_entry_space(noisy_box(self._entry, self.noise_std))
-        self._stream = [NOISE_STREAM] * (1 + count_wrappers(env, SensorNoise))  # apart from noise further in
+        self._stream = [NOISE_STREAM] * (1 + count_wrappers(env, SensorNoise))  # separate from noise of inner wrappers
         self._generator = np.random.default_rng()
         self._drawn = np.empty((0, *self._entry.shape), dtype=self._entry.dtype)
         self._n_used = 0
@@ -199,11 +199,12 @@ class History(EntryWrapper):
     """
     Replace one entry by its last ``length`` values, oldest first, joined along the first axis.
 
-    At reset the first value fills the whole history, and past actions are zero.
+    After a reset the first value fills the whole history, and past actions are zero.
 
     :param env: environment with a Dict observation
-    :param length: values kept, the current one included
-    :param actions: whether to append the ``length - 1`` actions between them (Box actions, one-dimensional float entry)
+    :param length: number of values in the history, the current one included
+    :param actions: whether to append the ``length - 1`` actions between the values; needs Box actions and a one-dimensional
+        entry of floats
     :param key: the entry that gets a history
     :raises ValueError: if ``length`` is not positive, or the entry or the actions are of another kind
     """
@@ -236,7 +237,7 @@ class History(EntryWrapper):
         return self._joined()
 
     def _next(self, value: np.ndarray, action: Any, reward: Any) -> np.ndarray:
-        self._values.append(value.copy())  # the environment may write into it again
+        self._values.append(value.copy())  # the environment may write into the array again
         if self._no_action.size:
             self._actions.append(np.array(action, dtype=np.float32).ravel())
         return self._joined()
@@ -248,13 +249,13 @@ class History(EntryWrapper):
 
 class PreviousAction(EntryWrapper):
     """
-    Append the previous action to one entry, one-hot where it is one of a number; and, on request, the previous reward.
+    Append the previous action to one entry, one-hot if actions are discrete, and on request the previous reward.
 
-    Zeros at reset.  Policies that remember need it where the dynamics depend on their actions.
+    Both are zero after a reset.  A policy with a memory needs its previous actions where the dynamics depend on them.
 
     :param env: environment with a Dict observation
     :param reward: whether to append the previous reward as well
-    :param key: the entry
+    :param key: key of the entry that gets the action
     :raises ValueError: if the entry is not a floating-point vector, or the actions are neither Box nor Discrete
     """
 
@@ -291,9 +292,9 @@ class PreviousAction(EntryWrapper):
 
 def count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
     """
-    :param env: wrapped
+    :param env: environment in its wrappers
     :param kind: class of a wrapper
-    :return: how many of its layers are of that class
+    :return: number of its layers of that class
     """
     count = 0
     while isinstance(env, gym.Wrapper):
@@ -309,7 +310,7 @@ def _check_kept(keep: Sequence[str]) -> Sequence[str]:
 
 
 def _in_single_precision(box: spaces.Box) -> spaces.Box:
-    """The same box; of floats, float32."""
+    """The same Box, in float32 if it is of floats."""
     if not np.issubdtype(box.dtype, np.floating):
         return box
     return spaces.Box(box.low.astype(np.float32), box.high.astype(np.float32), dtype=np.float32)

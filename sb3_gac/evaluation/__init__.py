@@ -1,1 +1,1 @@
-"""How robust a trained policy is to what happens to its sensors: the parts of :mod:`sb3_gac.evaluate`."""
+"""The robustness of a trained policy to disturbances of its sensors: the parts of :mod:`sb3_gac.evaluate`."""

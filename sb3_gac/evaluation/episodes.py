@@ -1,4 +1,4 @@
-"""Episodes of a policy, each from a seed of its own, whatever happens in the others."""
+"""Episodes of a policy, each from a seed of its own and independent of the others."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -11,11 +11,11 @@ from sb3_gac.evaluation.policies import EvaluatedPolicy
 
 class Episode(NamedTuple):
     """
-    What came of one.
+    The result of an episode.
 
-    :param total: sum of its rewards
-    :param length: steps
-    :param success: ``is_success`` of its last step's info, ``None`` where the environment does not report it
+    :param total: sum of the episode's rewards
+    :param length: number of steps
+    :param success: ``is_success`` in the last step's info, ``None`` where the environment does not report it
     """
 
     total: float
@@ -30,13 +30,16 @@ def run_episodes(
     on_end: Callable[[], None] = lambda: None,
 ) -> list[Episode]:
     """
-    Run episodes side by side. Each begins with a reset by its seed, so that it is the same in whatever order they end.
+    Run episodes side by side.
 
-    :param policy: to act, deterministically
-    :param envs: as many as are to run side by side, no more than episodes; those without one left wait for the others
-    :param seeds: one for each episode
-    :param on_end: called whenever an episode has ended
-    :return: one for each seed, in that order
+    Each episode begins with a reset by its seed, so its result does not depend on the order in which episodes end.
+
+    :param policy: policy that acts, deterministically
+    :param envs: environments that run side by side, no more than there are episodes; an environment without an episode left
+        waits for the others
+    :param seeds: seeds, one for each episode
+    :param on_end: function that is called whenever an episode has ended
+    :return: results, one for each seed, in the order of the seeds
     """
     results: dict[int, Episode] = {}
     waiting = iter(range(len(seeds)))
@@ -54,7 +57,7 @@ def run_episodes(
 
 
 class _Slot:
-    """An environment and the number of the episode that it is in, ``None`` if none is left for it."""
+    """An environment and the number of its current episode, which is ``None`` if no episode is left for it."""
 
     episode: int | None
 
@@ -70,8 +73,10 @@ class _Slot:
 
     def step(self, action: Any) -> tuple[int, Episode] | None:
         """
-        :param action: in the environment's range
-        :return: number of the episode that has ended, and what came of it
+        Take a step, and begin the next episode if the step has ended one.
+
+        :param action: action in the environment's range
+        :return: number and result of the episode, if this step has ended it, otherwise ``None``
         """
         if self.episode is None:
             return None

@@ -1,4 +1,4 @@
-"""The curve of an evaluation: return over what is varied, one panel for each."""
+"""The figure of an evaluation: the return over each part of the setting that is varied, in a panel of its own."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,14 +30,15 @@ def draw(
     path: Path,
 ) -> None:
     """
-    Mean returns with their intervals; a dotted line marks the value of training.
+    Draw mean returns with their intervals; a dotted line marks the value of training.
 
-    :param found: of all settings
-    :param curves: what is varied -> settings, in the order of its values; if nothing is, all settings stand side by side
+    :param found: setting -> policy -> outcome, for all settings
+    :param curves: name of a part of the setting that is varied -> settings, in the order of its values; if this is empty, all
+        settings stand side by side
     :param trained: setting of training
-    :param labels: policy -> how the legend names it
-    :param title: of the figure
-    :param path: of the picture
+    :param labels: policy -> its name in the legend
+    :param title: title of the figure
+    :param path: file of the picture
     """
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
@@ -79,5 +80,5 @@ def _draw_points(axis: Any, found: Mapping[Setting, Mapping[str, Outcome]], labe
 
 
 def _held(varied: str, setting: Setting) -> str:
-    """What the other parts of the setting are."""
+    """The other parts of the setting, in words."""
     return ", ".join(part for part in str(setting).split(", ") if not part.startswith(varied))

@@ -1,4 +1,4 @@
-"""What is evaluated: a model's deployed policy, its guider, or an exported file, each with a memory if it has one."""
+"""Policies to evaluate: a model's deployed policy, its guider, or an exported file, each with its memory if it has one."""
 
 import json
 from abc import ABC, abstractmethod
@@ -21,9 +21,9 @@ EXPORTED = (".onnx", ".pt")
 
 class EvaluatedPolicy(ABC):
     """
-    Deterministic actions of a policy for several episodes at once.
+    A policy that acts deterministically in several episodes at once.
 
-    :param entries: those of the observation that it is given, with their shapes; nothing else reaches it
+    :param entries: entries of the observation that the policy is given, with their shapes; no other entry reaches it
     """
 
     def __init__(self, entries: Shapes):
@@ -32,7 +32,7 @@ class EvaluatedPolicy(ABC):
     @abstractmethod
     def start(self, n_envs: int) -> None:
         """
-        Forget everything.
+        Empty the memory of all environments.
 
         :param n_envs: number of environments that are stepped side by side from here on, N
         """
@@ -40,17 +40,23 @@ class EvaluatedPolicy(ABC):
     @abstractmethod
     def act(self, observations: Observations, starts: np.ndarray) -> np.ndarray:
         r"""
-        :param observations: of all environments, (N, ...) of each entry, others than the policy's as well
-        :param starts: where an episode starts, shape (N,)
+        Choose the actions of one step in all environments.
+
+        :param observations: entry -> its values in all environments, shape (N, ...); there may be entries that the policy does
+            not read
+        :param starts: whether an episode starts in each environment, shape (N,)
         :return: actions, shape (N, \*action shape)
         """
 
 
 class ModelPolicy(EvaluatedPolicy):
     """
-    :param predict: a model's ``predict`` or ``predict_guider``
-    :param entries: that it reads, with their shapes
-    :param normalize: what ``VecNormalize`` does to observations, ``None`` if the model was trained without
+    A policy of a model.
+
+    :param predict: method ``predict`` or ``predict_guider`` of the model
+    :param entries: entries of the observation that the policy reads, with their shapes
+    :param normalize: function that normalises observations as ``VecNormalize`` did in training, ``None`` if the model was
+        trained without
     """
 
     def __init__(self, predict: Callable[..., Any], entries: Shapes, normalize: Callable[[Any], Any] | None):
@@ -59,11 +65,11 @@ class ModelPolicy(EvaluatedPolicy):
         self._state: Any = None
 
     def start(self, n_envs: int) -> None:
-        """See :meth:`EvaluatedPolicy.start`."""
+        """Empty the memory of all environments."""
         self._state = None
 
     def act(self, observations: Observations, starts: np.ndarray) -> np.ndarray:
-        """See :meth:`EvaluatedPolicy.act`."""
+        """Act by the model, as :meth:`EvaluatedPolicy.act` requires."""
         if self._normalize is not None:
             observations = self._normalize(dict(observations))
         seen = {key: observations[key] for key in self.entries}
@@ -73,10 +79,10 @@ class ModelPolicy(EvaluatedPolicy):
 
 class ExportedPolicy(EvaluatedPolicy):
     """
-    A file of :func:`sb3_gac.export_learner`, run once for each environment, as on as many robots.
+    A policy in a file of :func:`sb3_gac.export_learner`, loaded once for each environment, as on as many robots.
 
-    :param metadata: that the file has
-    :param load: makes what acts on single observations, with ``act`` and ``reset``
+    :param metadata: metadata in the file
+    :param load: function that loads the file as an object which acts on single observations, with ``act`` and ``reset``
     """
 
     def __init__(self, metadata: Mapping[str, Any], load: Callable[[], Any]):
@@ -85,11 +91,11 @@ class ExportedPolicy(EvaluatedPolicy):
         self._runners: Sequence[Any] = ()
 
     def start(self, n_envs: int) -> None:
-        """See :meth:`EvaluatedPolicy.start`."""
+        """Load the file anew for each environment, with an empty memory."""
         self._runners = [self._load() for _ in range(n_envs)]
 
     def act(self, observations: Observations, starts: np.ndarray) -> np.ndarray:
-        """See :meth:`EvaluatedPolicy.act`."""
+        """Act by the file, as :meth:`EvaluatedPolicy.act` requires."""
         actions = []
         for number, runner in enumerate(self._runners):
             if starts[number]:
@@ -100,10 +106,10 @@ class ExportedPolicy(EvaluatedPolicy):
 
 class TorchScriptRunner:
     """
-    An exported ``.pt`` file, used as :class:`sb3_gac.learner.OnnxPolicy` is.
+    A policy in an exported ``.pt`` file, used as :class:`sb3_gac.learner.OnnxPolicy` is.
 
-    :param module: that the file holds
-    :param metadata: that the file has
+    :param module: module in the file
+    :param metadata: metadata in the file
     """
 
     def __init__(self, module: Callable[..., Any], metadata: Mapping[str, Any]):
@@ -111,15 +117,17 @@ class TorchScriptRunner:
         self.reset()
 
     def reset(self) -> None:
-        """An episode starts."""
+        """Empty the memory, since an episode starts."""
         memory = self._metadata["memory"]
         self._state = [] if memory is None else [th.full((1, memory["size"]), memory["initial"])]
 
     @th.no_grad()
     def act(self, observation: Observations) -> np.ndarray:
         """
-        :param observation: a single one of each entry
-        :return: the action for it
+        Choose the action of one step.
+
+        :param observation: entry -> its values in a single observation
+        :return: action for the observation, in the environment's range
         """
         entries = [np.asarray(observation[entry["name"]], entry["dtype"])[None] for entry in self._metadata["entries"]]
         result = self._module(*map(th.as_tensor, entries), *self._state)
@@ -131,9 +139,12 @@ class TorchScriptRunner:
 
 def load_exported(path: Path) -> ExportedPolicy:
     """
-    :param path: of a file that :func:`sb3_gac.export_learner` wrote
+    Load the policy in an exported file.
+
+    :param path: file that :func:`sb3_gac.export_learner` wrote
+    :return: policy in the file
     :raises ValueError: if it is another file
-    :raises ImportError: if it is for ONNX, and onnxruntime is not installed
+    :raises ImportError: if it is an ONNX file, and onnxruntime is not installed
     """
     if path.suffix == ".onnx":
         from sb3_gac.learner import OnnxPolicy
@@ -152,17 +163,23 @@ def load_exported(path: Path) -> ExportedPolicy:
 
 def learner_of(model: AsymmetricAlgorithm, normalize: Callable[[Any], Any] | None = None) -> ModelPolicy:
     """
-    :param model: whose deployed policy is meant
-    :param normalize: see :class:`ModelPolicy`
+    Take the deployed policy of a model.
+
+    :param model: trained model
+    :param normalize: function that normalises observations, as in :class:`ModelPolicy`
+    :return: deployed policy of the model
     """
     return ModelPolicy(model.predict, _shapes(model, [model.policy.roles.deployed]), normalize)
 
 
 def guider_of(model: Any, normalize: Callable[[Any], Any] | None = None) -> ModelPolicy:
     """
-    :param model: whose guider is meant, the policy that sees what is privileged
-    :param normalize: see :class:`ModelPolicy`
-    :raises ValueError: if its algorithm has none
+    Take the guider of a model.
+
+    :param model: trained model
+    :param normalize: function that normalises observations, as in :class:`ModelPolicy`
+    :return: guider of the model, the policy that sees privileged entries
+    :raises ValueError: if the model's algorithm has no guider
     """
     if not hasattr(model, "predict_guider"):
         raise ValueError(
@@ -180,11 +197,15 @@ def _shapes(model: AsymmetricAlgorithm, roles: Sequence[str]) -> Shapes:
 
 def normalizer_of(model: AsymmetricAlgorithm, statistics: Path | None, env: Any) -> Callable[[Any], Any] | None:
     """
-    :param model: which says whether it learned from normalised observations
-    :param statistics: file that ``VecNormalize.save`` wrote
-    :param env: that the observations come from
-    :return: what ``VecNormalize`` did in training to a batch of observations, ``None`` if the model was trained without
-    :raises ValueError: if there is a file for a model that was trained without, or none for one that was trained with it
+    Find the normalisation that a model's observations need.
+
+    :param model: trained model, which knows whether it learned from normalised observations
+    :param statistics: file that ``VecNormalize.save`` wrote, ``None`` for no file
+    :param env: environment that the observations come from
+    :return: function that normalises a batch of observations as ``VecNormalize`` did in training, ``None`` if the model was
+        trained without
+    :raises ValueError: if a file is given for a model trained without ``VecNormalize``, or no file for one trained with it
+    :raises FileNotFoundError: if there is no such file
     """
     if not model.trained_normalised:
         if statistics is not None:

@@ -1,4 +1,4 @@
-"""What came out of an evaluation: rows of a table, and all of it as JSON."""
+"""The results of an evaluation: rows of a table, and all numbers as JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from sb3_gac.evaluation.episodes import Episode
 from sb3_gac.evaluation.settings import UNDISTURBED, Setting
 from sb3_gac.evaluation.statistics import Interval, mean_interval
 
-#: Setting -> policy -> its episodes, from the same seeds in all of them
+#: Setting -> policy -> its episodes, from the same seeds in all settings
 Results = Mapping[Setting, Mapping[str, Sequence[Episode]]]
 HEADER = ("noise", "delay", "drop", "policy", "return", "std", "95% of the mean", "share", "difference", "success")
 NOTHING = "-"
@@ -21,15 +21,15 @@ LEGEND = "share, difference: of the undisturbed return, episode by episode from 
 @dataclass(frozen=True)
 class Outcome:
     """
-    How a policy did in a setting.
+    The outcome of a policy's episodes in a setting.
 
-    :param returns: one for each seed
-    :param lengths: steps of the episodes
-    :param successes: whether each was one, ``None`` where the environment does not say
-    :param mean: of the returns, with its interval over episodes
-    :param std: of the returns, ``nan`` of a single one
-    :param difference: mean of what each episode returned more than the undisturbed one from its seed, with its interval
-    :param share: mean return over the undisturbed one, ``None`` unless that is above 0
+    :param returns: returns, one for each seed, shape (number of episodes,)
+    :param lengths: numbers of steps of the episodes, shape (number of episodes,)
+    :param successes: whether each episode was a success, ``None`` where the environment does not report it
+    :param mean: mean of the returns, with its interval over episodes
+    :param std: standard deviation of the returns, ``nan`` for a single episode
+    :param difference: mean of the difference between each return and the undisturbed one from the same seed, with its interval
+    :param share: mean return divided by the undisturbed mean return, ``None`` unless the latter is above 0
     """
 
     returns: np.ndarray
@@ -41,7 +41,7 @@ class Outcome:
     share: float | None
 
     def as_json(self) -> dict[str, Any]:
-        """Numbers, with ``None`` for what a single episode can't tell."""
+        """The outcome as JSON holds it, with ``None`` for numbers that a single episode does not have."""
         return {
             "mean": self.mean.mean,
             "std": _finite(self.std),
@@ -56,14 +56,17 @@ class Outcome:
 
     @property
     def success(self) -> float | None:
-        """Share of the episodes that were one."""
+        """Share of the episodes that were a success, ``None`` where the environment does not report successes."""
         return None if self.successes is None else float(self.successes.mean())
 
 
 def outcome(episodes: Sequence[Episode], undisturbed: Sequence[Episode]) -> Outcome:
     """
-    :param episodes: of a policy in a setting
-    :param undisturbed: of the same policy, from the same seeds
+    Compare a policy's episodes in a setting with its undisturbed ones.
+
+    :param episodes: episodes of a policy in a setting
+    :param undisturbed: undisturbed episodes of the same policy, from the same seeds
+    :return: outcome of the policy in the setting
     """
     returns, before = (np.array([episode.total for episode in those]) for those in (episodes, undisturbed))
     successes = [episode.success for episode in episodes]
@@ -80,7 +83,10 @@ def outcome(episodes: Sequence[Episode], undisturbed: Sequence[Episode]) -> Outc
 
 def outcomes(results: Results) -> dict[Setting, dict[str, Outcome]]:
     """
-    :param results: with those of the undisturbed setting
+    Compare all policies in all settings with their undisturbed episodes.
+
+    :param results: episodes of all settings, the undisturbed one among them
+    :return: setting -> policy -> outcome
     """
     undisturbed = results[UNDISTURBED]
     return {
@@ -91,7 +97,7 @@ def outcomes(results: Results) -> dict[Setting, dict[str, Outcome]]:
 
 def header_of(episodes: Sequence[Episode]) -> tuple[str, ...]:
     """
-    :param episodes: of any setting
+    :param episodes: episodes of any setting
     :return: names of the columns; successes are the last one, and left out where the environment does not report them
     """
     return HEADER if all(episode.success is not None for episode in episodes) else HEADER[:-1]
@@ -99,9 +105,11 @@ def header_of(episodes: Sequence[Episode]) -> tuple[str, ...]:
 
 def row(setting: Setting, policy: str, found: Outcome) -> list[str]:
     """
-    :param setting: of the sensor
-    :param policy: its name
-    :param found: how it did
+    Write an outcome as a row of the table.
+
+    :param setting: setting of the sensor
+    :param policy: name of the policy
+    :param found: outcome of the policy in the setting
     :return: cells under :data:`HEADER`
     """
     is_reference = setting == UNDISTURBED
@@ -121,9 +129,11 @@ def row(setting: Setting, policy: str, found: Outcome) -> list[str]:
 
 def in_digits(value: float, sign: str = "") -> str:
     """
-    :param value: a return or a part of one
-    :param sign: of the format, "+" to write it before what is positive
-    :return: to four digits or to the last whole number, ``NOTHING`` if it is not finite
+    Write a return as text.
+
+    :param value: return, or difference of returns
+    :param sign: sign in the number's format, "+" to write it before positive numbers
+    :return: the value in four digits, from 1,000 on as a whole number; ``NOTHING`` if it is not finite
     """
     if not math.isfinite(value):
         return NOTHING

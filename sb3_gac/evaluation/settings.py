@@ -1,4 +1,4 @@
-"""What the sensor does in an evaluation, and the environment in which it does so."""
+"""The settings of the sensor in an evaluation, and the environment that brings them about."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -18,18 +18,18 @@ from sb3_gac.envs.suites import SUITES, batch_factory, env_id_of, is_batched, su
 from sb3_gac.training.environments import in_wrappers
 
 CONFIGURATION = "config.yaml"
-#: What is evaluated if nothing else is asked for
+#: Part of the setting -> values that are evaluated if none are asked for
 DEFAULTS: dict[str, list[Any]] = {"noise": [0.0, 0.1, 0.2, 0.3], "delay": [0, 1, 2], "drop": [0.0, 0.1, 0.3]}
-#: Of a setting -> what environments of this package call it
+#: Part of the setting -> argument of this package's environments
 ARGUMENTS = {"noise": "noise_std", "delay": "delay", "drop": "drop"}
 
 
 class Setting(NamedTuple):
     """
-    What the sensor does.
+    A setting of the sensor.
 
     :param noise: standard deviation of the noise on ``partial``, in its own units
-    :param delay: steps by which ``partial`` is late
+    :param delay: number of steps by which ``partial`` is late
     :param drop: probability that an observation is lost, and the last one shown again
     """
 
@@ -46,12 +46,14 @@ UNDISTURBED = Setting()
 
 def plan(asked: Mapping[str, Sequence[Any]], trained: Setting) -> tuple[list[Setting], dict[str, list[Setting]]]:
     """
-    One thing is varied at a time. A single value holds for all settings; of several, each makes a setting, and so does that of
-    training; in these, all else is as in training, or what a single value says.
+    Plan the settings of an evaluation, in which one part of the setting is varied at a time.
+
+    A part with a single value has it in all settings but the undisturbed one. A part with several values is varied: there is a
+    setting for each value and for that of training, in which each other part has its single value, or else that of training.
 
     :param asked: name of a part of the setting -> its values
-    :param trained: the setting of training
-    :return: all settings, the undisturbed one first; and name -> those in which it varies, in ascending order
+    :param trained: setting of training
+    :return: all settings, the undisturbed one first; and name of each part that is varied -> its settings, in ascending order
     """
     base = trained._replace(**{name: values[0] for name, values in asked.items() if len(set(values)) == 1})
     curves = {
@@ -66,11 +68,13 @@ def plan(asked: Mapping[str, Sequence[Any]], trained: Setting) -> tuple[list[Set
 @dataclass(frozen=True)
 class Environment:
     """
-    Where a policy is evaluated.
+    The environment in which a policy is evaluated.
 
-    :param env_id: of gymnasium, ``module:id`` of one that a module registers, or ``module:name`` of a class or function
-    :param kwargs: keyword arguments of it
-    :param wrappers: around it, from the inside to the outside, each ``module:Class`` and its keyword arguments
+    :param env_id: gymnasium's id, ``module:id`` of an environment that a module registers, or ``module:name`` of a class or a
+        function that makes one
+    :param kwargs: keyword arguments of the environment
+    :param wrappers: wrappers around the environment, from the inside to the outside, each ``module:Class`` -> its keyword
+        arguments
     """
 
     env_id: str
@@ -79,8 +83,11 @@ class Environment:
 
     def make(self, setting: Setting, render_mode: str | None = None) -> gym.Env:
         """
-        :param setting: that the environment's own arguments bring about where it has them, and wrappers where it has not
-        :param render_mode: of gymnasium
+        Make the environment in a setting, by its own arguments where it has them, and by wrappers where it has not.
+
+        :param setting: setting of the sensor
+        :param render_mode: gymnasium's render mode, ``None`` for none
+        :return: environment in the setting
         :raises ValueError: if there is no such environment, or its observations have no ``partial``
         """
         values = {ARGUMENTS[name]: value for name, value in setting._asdict().items()}
@@ -94,7 +101,7 @@ class Environment:
 
     @property
     def trained(self) -> Setting:
-        """What the sensor does if nobody says otherwise: the environment's arguments, or their defaults."""
+        """Setting of training, as the environment's arguments or their defaults say."""
         known: dict[str, Any] = {}
         for name, argument in ARGUMENTS.items():
             default = self._parameters[argument].default if argument in self._parameters else inspect.Parameter.empty
@@ -108,7 +115,7 @@ class Environment:
 
     @property
     def has_noise(self) -> bool:
-        """Whether sensor noise is its own argument; if not, noise comes on top of what it has."""
+        """Whether the environment has an argument for sensor noise; if not, noise comes on top of its own."""
         return ARGUMENTS["noise"] in self._parameters
 
     @property
@@ -126,12 +133,12 @@ class Environment:
 
     @property
     def _parameters(self) -> Mapping[str, inspect.Parameter]:
-        """Those of what makes it."""
-        creator = self._creator  # which imports its module
+        """Parameters of the class or function that makes the environment."""
+        creator = self._creator  # imports the environment's module
         name = self.env_id.rpartition(":")[2]
         if name not in gym.registry:
             if ":" not in self.env_id:
-                gym.spec(self.env_id)  # raises, and says what may be meant
+                gym.spec(self.env_id)  # raises an error that says which id may be meant
             return inspect.signature(creator).parameters
         if is_batched(name):
             return _of_batch(name)
@@ -142,7 +149,7 @@ class Environment:
 
 
 def _of_batch(env_id: str) -> Mapping[str, inspect.Parameter]:
-    """Simulators of many take noise, some of them under ``**kwargs``."""
+    """Parameters of a simulator that steps a batch; it takes noise, some simulators under ``**kwargs``."""
     parameters = dict(inspect.signature(batch_factory(env_id)[0]).parameters)
     if SUITES[suite_of(env_id) or ""].sensor_noise:
         name = ARGUMENTS["noise"]
@@ -152,8 +159,10 @@ def _of_batch(env_id: str) -> Mapping[str, inspect.Parameter]:
 
 def environment_of_run(directory: Path) -> Environment:
     """
-    :param directory: of a run of ``sb3_gac.train``, or of the benchmarks
-    :return: the environment that it was trained in
+    Read from a run's configuration in which environment it was trained.
+
+    :param directory: folder of a run of ``sb3_gac.train``, or of the benchmarks
+    :return: environment of the run's training
     """
     configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
     run = configuration.get("run", configuration)
@@ -161,17 +170,19 @@ def environment_of_run(directory: Path) -> Environment:
     if made is not None:
         return Environment(made["id"], made["kwargs"], made.get("wrappers", ()))
     given = {"noise_std": run["noise"], "history": run.get("history"), "privileged": run.get("privileged")}
-    usual = {"history": 1, "privileged": "state"}  # which not every environment has as an argument
+    usual = {"history": 1, "privileged": "state"}  # not every environment has these arguments
     kwargs = {name: value for name, value in given.items() if value not in (None, usual.get(name))}
     return Environment(env_id_of(run["task"]), kwargs)
 
 
 def check_fits(entries: Mapping[str, tuple[int, ...]], env: gym.Env, name: str) -> None:
     """
-    :param entries: that a policy reads, with their shapes
-    :param env: whose observations it is to get
-    :param name: of the environment, for the message
-    :raises ValueError: naming the entry that is missing or of another shape
+    Check that an environment shows the entries that a policy reads.
+
+    :param entries: entries that the policy reads, with their shapes
+    :param env: environment whose observations the policy is to get
+    :param name: name of the environment, for the message
+    :raises ValueError: if an entry is missing or of another shape; the message names it
     """
     shown = env.observation_space.spaces  # type: ignore[attr-defined]
     for key, shape in entries.items():
@@ -188,7 +199,7 @@ def check_fits(entries: Mapping[str, tuple[int, ...]], env: gym.Env, name: str) 
 
 def is_real_valued(env: gym.Env) -> bool:
     """
-    :param env: with ``partial``
-    :return: whether noise can be added to it
+    :param env: environment with an entry ``partial``
+    :return: whether ``partial`` is of floats, to which noise can be added
     """
     return bool(np.issubdtype(env.observation_space[PARTIAL].dtype, np.floating))  # type: ignore[index]

@@ -1,4 +1,4 @@
-"""Means over episodes, with intervals by Student's t; scipy, which has its quantiles, is no requirement of this package."""
+"""Means over episodes, with intervals by Student's t; its quantiles are here, since this package does not require scipy."""
 
 import math
 from typing import NamedTuple
@@ -10,11 +10,11 @@ CONFIDENCE = 0.95
 
 class Interval(NamedTuple):
     """
-    A mean and where it may be.
+    A mean and its confidence interval.
 
-    :param mean: of a sample
-    :param low: end of its interval, ``-inf`` for a sample of one
-    :param high: the other end
+    :param mean: mean of a sample
+    :param low: lower end of the interval, ``-inf`` for a sample of one
+    :param high: upper end of the interval, ``inf`` for a sample of one
     """
 
     mean: float
@@ -24,8 +24,8 @@ class Interval(NamedTuple):
 
 def probability_within(t: float, degrees: int) -> float:
     """
-    :param t: at least 0
-    :param degrees: of freedom, a whole number of at least 1
+    :param t: bound on the variable's size, at least 0
+    :param degrees: degrees of freedom, a whole number of at least 1
     :return: probability that a variable with Student's t distribution is between -t and t (Abramowitz and Stegun, 26.7.3 and
         26.7.4)
     """
@@ -40,14 +40,14 @@ def probability_within(t: float, degrees: int) -> float:
 
 def t_quantile(degrees: int, confidence: float = CONFIDENCE) -> float:
     """
-    :param degrees: of freedom, a whole number of at least 1
-    :param confidence: above 0, below 1
-    :return: t with :func:`probability_within` of ``confidence``
+    :param degrees: degrees of freedom, a whole number of at least 1
+    :param confidence: probability, above 0 and below 1
+    :return: t at which :func:`probability_within` is ``confidence``
     """
     low, high = 0.0, 1.0
     while probability_within(high, degrees) < confidence:
         high *= 2
-    for _ in range(80):  # halving: more than the digits of a float
+    for _ in range(80):  # bisection: more halvings than a float has digits
         middle = (low + high) / 2
         low, high = (middle, high) if probability_within(middle, degrees) < confidence else (low, middle)
     return (low + high) / 2
@@ -55,8 +55,10 @@ def t_quantile(degrees: int, confidence: float = CONFIDENCE) -> float:
 
 def mean_interval(sample: np.ndarray) -> Interval:
     """
+    Compute the mean of a sample and its confidence interval.
+
     :param sample: independent values, shape (N,), at least one
-    :return: their mean, and its interval by Student's t
+    :return: mean of the sample, with its interval by Student's t
     """
     mean, count = float(sample.mean()), len(sample)
     if count < 2:

@@ -1,4 +1,4 @@
-"""A film of an episode: the simulator, and under it what the sensor measured beside what the policy got of it."""
+"""A film of an episode: the simulator, and under it the sensor's measurements beside the values that the policy got."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,9 +24,9 @@ Series = list[np.ndarray]
 
 class Tap(gym.ObservationWrapper):
     """
-    Remembers an entry as it was last.
+    Keep the newest value of ``partial``.
 
-    :param env: whose observation stays as it is
+    :param env: environment with an entry ``partial``; its observations stay as they are
     """
 
     def __init__(self, env: gym.Env):
@@ -34,15 +34,20 @@ class Tap(gym.ObservationWrapper):
         self.latest = np.empty(0)
 
     def observation(self, observation: Any) -> Any:
-        """See gymnasium's ``ObservationWrapper``."""
+        """
+        :param observation: observation of the environment
+        :return: the same observation, whose ``partial`` was copied
+        """
         self.latest = np.array(observation[PARTIAL])
         return observation
 
 
 def tapped(env: gym.Env) -> tuple[gym.Env, Tap, Tap]:
     """
-    :param env: wrapped, changed in place
-    :return: the environment, and two taps of it: of what the sensor measures, without noise, and of what arrives
+    Put two taps into an environment.
+
+    :param env: environment in its wrappers, changed in place
+    :return: the environment; a tap of the sensor's values without noise; and a tap of the values that arrive
     """
     arriving = sensor_layer(env)
     disturbing = [layer for layer in layers(arriving) if isinstance(layer, (SensorNoise, SensorDelay, DroppedFrames))]
@@ -60,10 +65,12 @@ def tapped(env: gym.Env) -> tuple[gym.Env, Tap, Tap]:
 
 def check_can_film(env: gym.Env, name: str) -> None:
     """
-    :param env: made with ``render_mode="rgb_array"``
-    :param name: of the environment, for the message
-    :raises ImportError: if what writes videos is not installed, saying how to
-    :raises RuntimeError: if the environment can't be drawn, saying why
+    Check that an environment can be filmed.
+
+    :param env: environment made with ``render_mode="rgb_array"``
+    :param name: name of the environment, for the message
+    :raises ImportError: if a module that writes videos is not installed; the message says how to install it
+    :raises RuntimeError: if the environment can't be drawn; the message says why
     """
     for module in ("moviepy", "PIL"):
         import_extra(module, EXTRA, PROGRAM)
@@ -80,12 +87,14 @@ def check_can_film(env: gym.Env, name: str) -> None:
 
 def film(policy: EvaluatedPolicy, env: gym.Env, seed: int, title: str, path: Path) -> float:
     """
-    :param policy: to act, deterministically
-    :param env: made with ``render_mode="rgb_array"``, not yet reset
-    :param seed: of the episode
-    :param title: of the setting
-    :param path: of the video
-    :return: the episode's return
+    Film an episode.
+
+    :param policy: policy that acts, deterministically
+    :param env: environment made with ``render_mode="rgb_array"``, not yet reset
+    :param seed: seed of the episode
+    :param title: title of the setting, for the caption
+    :param path: file of the video
+    :return: return of the episode
     """
     from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 
@@ -109,7 +118,11 @@ def film(policy: EvaluatedPolicy, env: gym.Env, seed: int, title: str, path: Pat
 def _played(
     policy: EvaluatedPolicy, env: gym.Env, seed: int, measured: Tap, got: Tap
 ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
-    """Of each step, from the reset on: what was measured, what arrived, and the return so far. It is the same every time."""
+    """
+    Play an episode, which is the same each time.
+
+    For the reset and for each step it yields the value that was measured, the value that arrived, and the return so far.
+    """
     observation, _ = env.reset(seed=seed)
     policy.start(1)
     starts, total, is_over = np.ones(1, dtype=bool), 0.0, False
@@ -123,11 +136,13 @@ def _played(
 
 def _composed(picture: np.ndarray, series: Series, step: int, caption: str) -> np.ndarray:
     """
-    :param picture: of the simulator, shape (H, W, 3)
-    :param series: what was measured and what arrived in all steps, shapes (T, ...)
-    :param step: to show
-    :param caption: above
-    :return: picture between caption and strip, with even sides, as video codecs have them
+    Draw a frame of the video.
+
+    :param picture: picture of the simulator, shape (H, W, 3)
+    :param series: values that were measured, and values that arrived, of shape (T, ...) each
+    :param step: number of the step to show, from 0 at the reset
+    :param caption: text above the picture
+    :return: picture between caption and strip; its width and height are even, as video codecs need them
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -145,7 +160,7 @@ def _composed(picture: np.ndarray, series: Series, step: int, caption: str) -> n
 
 
 def _draw_strip(draw: Any, font: Any, series: Series, step: int, box: tuple[int, int, int, int]) -> None:
-    """The last steps of the component that moves most, as it was measured and as it arrived."""
+    """Draw the last steps of the component that moves most, as it was measured and as it arrived."""
     left, top, right, bottom = box
     component = int(np.argmax(series[0].std(axis=0)))
     measured, got = (values[:, component] for values in series)

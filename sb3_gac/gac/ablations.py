@@ -11,9 +11,9 @@ from sb3_gac.math.losses import distillation_loss
 
 class GACShare(GAC):
     """
-    GAC_share: the learner climbs the guided critics (eq. 16 with Q_theta); it has none of its own.
+    GAC_share: the learner climbs the guided critics (eq. 16 with Q_theta) and has no critics of its own.
 
-    ``learner_kl_scale="auto"`` is 1 whatever the guider: the pull is part of what is compared.
+    ``learner_kl_scale="auto"`` is 1 with every kind of guider, since the ablation is about the pull of that term.
     """
 
     def _auto_learner_kl_weight(self) -> float:
@@ -24,7 +24,7 @@ class GACShare(GAC):
 
 
 class GACWithoutQ(GACShare):
-    """GAC_wo_Q: the learner imitates the guider and nothing else (eq. 14, whatever ``learner_kl_scale``)."""
+    """GAC_wo_Q: the learner imitates the guider and does nothing else (eq. 14); ``learner_kl_scale`` has no effect."""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -37,7 +37,7 @@ class GACWithoutQ(GACShare):
     def learner_loss(
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
     ) -> Loss:
-        """Eq. 14."""
+        """The learner's loss of eq. 14: its KL from the guider, and the fit of its deployed std."""
         now = self.policy.action_distributions(guider.now.detach(), learner.now)
         kl = now.guider.detach().kl_of_means(now.learner, self.kl_reduction)
         return self._with_deployment_losses(distillation_loss(kl, batch.mask), now, batch.mask)

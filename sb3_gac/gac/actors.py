@@ -1,4 +1,4 @@
-"""The two policies: a learner on its own entries, and a guider relative to it, to its average, or independent of it."""
+"""The two policies: a learner on its own entries, and a guider that is relative to the learner or independent of it."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -16,8 +16,8 @@ class Learner(DeployedPolicy):
     """
     The deployed policy.
 
-    :param owns_std: whether a Gaussian's std is trained by the learner's objective; if not, it borrows the guider's in
-        training, and its own, fitted to that, serves ``predict(deterministic=False)`` where there is no guider
+    :param owns_std: whether the learner's objective trains a Gaussian's std; if not, the learner borrows the guider's std in
+        training, and a std of its own, fitted to the guider's, serves ``predict(deterministic=False)`` at deployment
     """
 
     def __init__(self, *args: Any, owns_std: bool = True, **kwargs: Any):
@@ -26,21 +26,24 @@ class Learner(DeployedPolicy):
 
     def output(self, latent: th.Tensor) -> Distribution:
         r"""
-        :param latent: shape (\*E, H)
-        :return: at deployment; the gradient of a std that is fitted stops at its own layer; shapes (\*E, A)
+        :param latent: last hidden layer of the learner's network, shape (\*E, H)
+        :return: action distribution of the deployed learner, shapes (\*E, A); where the learner does not own its std, the
+            gradient of the std stops at the layer that outputs it
         """
         return self.head(latent, detach_std=not self.owns_std)
 
     def deployment_parameters(self) -> list[nn.Parameter]:
-        """Those that serve at deployment only."""
+        """The parameters that serve at deployment only: those of a std that is fitted to the guider's, else none."""
         return [] if self.owns_std else self.head.deployment_parameters()
 
     def deployment_losses(self, deployed: Any, learner: Any, mask: th.Tensor | None = None) -> dict[str, th.Tensor]:
         r"""
-        :param deployed: what :meth:`output` returned, shapes (\*E, A)
-        :param learner: with the std that it has in training, shapes (\*E, A)
-        :param mask: shape (\*E)
-        :return: name -> scalar, what :meth:`deployment_parameters` are fitted with
+        The losses that fit :meth:`deployment_parameters`.
+
+        :param deployed: action distribution of the deployed learner, from :meth:`output`, shapes (\*E, A)
+        :param learner: the learner's action distribution in training, with the guider's std, shapes (\*E, A)
+        :param mask: 1 for valid steps and 0 for padding, shape (\*E); ``None`` if all are valid
+        :return: name of a loss -> scalar; empty if there is nothing to fit
         """
         return {} if self.owns_std else self.head.deployment_losses(deployed, learner, mask)
 
@@ -49,12 +52,13 @@ class Learner(DeployedPolicy):
 
 
 class LearnerAsActor(Actor, Learner):
-    """The learner under SB3's name: called, it returns actions, and all else is the learner's own."""
+    """The learner in the form of SB3's ``actor``: a call returns actions, and all else is the learner's own."""
 
     @classmethod
     def of(cls, learner: Learner) -> "LearnerAsActor":
         """
-        :param learner: whose parameters and attributes it shares
+        :param learner: learner that the actor shares all parameters and attributes with
+        :return: actor that is the same network
         """
         actor = cls.__new__(cls)
         object.__setattr__(actor, "__dict__", learner.__dict__)
@@ -65,11 +69,11 @@ class Guider(RolePolicy):
     """
     The privileged policy in the paper's form: a network of its own, nothing shared with the learner.
 
-    :param max_kl: hard bound on KL(guider || learner), or ``None``: a Gaussian's mean is projected onto that ball
-    :param kl_reduction: how the bounded KL is reduced over action dimensions
+    :param max_kl: hard bound on KL(guider || learner) in every state, held by projecting a Gaussian's mean; ``None`` for none
+    :param kl_reduction: reduction of the bounded KL over action dimensions, "mean" or "sum"
     """
 
-    #: Whether it needs a target of the learner
+    #: Whether the guider needs a target network of the learner
     needs_target: ClassVar[bool] = False
 
     def __init__(self, *args: Any, max_kl: float | None = None, kl_reduction: str = "mean", **kwargs: Any):
@@ -79,9 +83,11 @@ class Guider(RolePolicy):
 
     def relative_to(self, learner: Any, output: Any) -> Distribution:
         """
-        :param learner: its distribution for the same observations; treated as a constant, shapes (B, A)
-        :param output: of :meth:`distribution`, shapes (B, A)
-        :return: the guider's action distribution, shapes (B, A)
+        The guider's action distribution, given the learner's.
+
+        :param learner: the learner's distribution for the same observations, treated as a constant, shapes (B, A)
+        :param output: output of the guider's network, from :meth:`distribution`, shapes (B, A)
+        :return: action distribution of the guider, shapes (B, A)
         """
         if self.max_kl is None:
             return output
@@ -103,10 +109,11 @@ class Guider(RolePolicy):
 
 class ResidualGuider(Guider):
     """
-    The guider as the learner plus a privileged correction delta: in units of the std, so that KL = 1/2 ||delta||^2
-    exactly, or of the logits.
+    The guider as the learner plus a privileged correction delta.
 
-    Neither the learner's drift nor a shrinking std moves that KL; delta = 0 is the learner itself.
+    A Gaussian's mean is moved by delta in units of the std, so that KL = 1/2 ||delta||^2 exactly, and neither the learner's
+    drift nor a shrinking std moves the KL. With discrete actions delta is added to the logits. At delta = 0 the guider is the
+    learner itself.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -114,34 +121,36 @@ class ResidualGuider(Guider):
         self.head.shrink(DELTA_INIT_SCALE)
 
     def relative_to(self, learner: Any, output: Any) -> Distribution:
-        """See :meth:`Guider.relative_to`."""
+        """The learner moved by the correction, see :meth:`Guider.relative_to`."""
         return learner.with_residual(self._bounded(output))
 
 
 class LaggedOutput(NamedTuple):
     """
-    What a lagged guider's networks compute.
+    The output of a lagged guider's networks.
 
-    :param base: the lagged learner's distribution, a constant, shapes (\\*E, A)
-    :param correction: delta, shapes (\\*E, A)
+    :param base: action distribution of the learner's Polyak average, a constant, shapes (\\*E, A)
+    :param correction: privileged correction delta, shapes (\\*E, A)
     """
 
     base: Any
     correction: Any
 
     def detach(self) -> "LaggedOutput":
-        """The same as a constant."""
+        """The same output as a constant."""
         return LaggedOutput(self.base, self.correction.detach())
 
     def with_std_of(self, lender: Any) -> "LaggedOutput":
-        """See :meth:`TanhGaussian.with_std_of`."""
+        """The same output with the lender's std, as a constant, see :meth:`TanhGaussian.with_std_of`."""
         return LaggedOutput(self.base, self.correction.with_std_of(lender))
 
 
 class LaggedGuider(ResidualGuider):
     """
-    The guider as the learner's Polyak average plus a privileged correction, m_mu = m_pi_bar + std delta: the learner can
-    absorb the correction, and the KL, which tells how far it has, depends on the learner.
+    The guider as the learner's Polyak average plus a privileged correction delta: mean_mu = mean_pi_bar + std delta.
+
+    The learner can absorb the correction, since its average stays behind. The KL depends on the learner, and falls as the
+    learner absorbs the correction.
     """
 
     needs_target = True
@@ -149,19 +158,21 @@ class LaggedGuider(ResidualGuider):
 
     def follow(self, learner: Learner) -> None:
         """
-        :param learner: the average, which is no part of this network
+        Set the learner's average, which is no part of this network.
+
+        :param learner: target network of the learner, its Polyak average
         """
         self._followed = (learner,)
 
     def distribution(self, obs: PyTorchObs) -> Any:
-        """See :meth:`RolePolicy.distribution`."""
+        """The average's distribution and the correction to it, see :meth:`RolePolicy.distribution`."""
         assert self._followed is not None
         with th.no_grad():
             base = self._followed[0].distribution(obs)
         return LaggedOutput(base, super().distribution(obs))
 
     def relative_to(self, learner: Any, output: LaggedOutput) -> Distribution:
-        """See :meth:`Guider.relative_to`."""
+        """The learner's average moved by the correction, see :meth:`Guider.relative_to`."""
         return Guider.relative_to(self, learner, output.base.with_residual(output.correction))
 
 

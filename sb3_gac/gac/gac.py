@@ -26,12 +26,12 @@ from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.schedules import as_schedule
 
 KL_COEF_START = 1.0
-#: Of target_kl="auto": its start, its bounds, and what it is multiplied with or divided by at a comparison
+#: Start and bounds of the target with target_kl="auto", and the factor that it rises or falls by at a comparison
 AUTO_TARGET_KL, AUTO_TARGET_KL_BOUNDS, AUTO_TARGET_KL_FACTOR = 0.0033, (1e-4, 0.05), 1.1
-#: Environment steps between two comparisons of the policies' returns, and episodes of each that are compared
+#: Environment steps between two comparisons of the policies' returns, and number of episodes of each policy that count
 COMPARE_EVERY, COMPARED_EPISODES = 1_000, 20
 
-#: See :class:`sb3_gac.base.signs.GuidanceSigns`
+#: Cause -> message of the warning, see :class:`sb3_gac.base.signs.GuidanceSigns`
 REMEDIES = {
     "nothing by returns": (
         "the guider's own episodes return {guider:.5g} and the learner's {learner:.5g}, a difference of {low:.2f} to "
@@ -68,33 +68,35 @@ REMEDIES = {
 
 class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # type: ignore[override]
     """
-    Guided Actor-Critic: a guider that sees everything collects the data, a learner that sees ``partial`` alone is
-    pulled towards it by a KL constraint and by critics of its own. ``predict`` is the learner.
+    Guided Actor-Critic: a guider that sees everything collects the data, and a learner that sees ``partial`` alone learns from
+    these data with critics of its own. A KL constraint keeps the two policies close. ``predict`` is the learner's.
 
-    Guider and learner each fit their critics (eqs. 12, 15) and then climb them (eqs. 13, 16); then beta and alpha follow.
+    In each gradient step the guider and the learner fit their critics (eqs. 12, 15) and climb them (eqs. 13, 16); then the
+    entropy temperature beta and the weight alpha of the KL take a step each.
 
     All arguments that are not described here are those of :class:`AsymmetricOffPolicyAlgorithm`, most of them SAC's.
 
-    :param target_kl: bound on KL(guider || learner), reduced as ``kl_reduction`` says; a number or a schedule, which may be
-        text, see :mod:`sb3_gac.schedules`; or "auto": it follows from episodes of both policies, see :meth:`compare`, and
-        ``behaviour`` must give the learner a share of them
+    :param target_kl: bound on KL(guider || learner), reduced as ``kl_reduction`` says: a number, a schedule (a function, or a
+        text that :mod:`sb3_gac.schedules` describes), or "auto", which adapts the bound to the returns of both policies'
+        episodes, see :meth:`compare`; ``behaviour`` must then give each policy a share of the episodes
     :param kl_coef: weight alpha of the KL: "auto" (learned, eq. 17), "auto_<start value>" or a number
     :param kl_coef_bounds: smallest and largest value of a learned ``kl_coef``
     :param kl_coef_learning_rate: Adam's step size for a learned ``kl_coef``
-    :param kl_reduction: KL over action dimensions: "mean" or "sum"
-    :param guider: "residual": learner plus a privileged correction; "lagged": the learner's Polyak average plus one;
-        "independent": a network of its own (the paper's)
-    :param max_kl: hard bound on KL for every state, by projecting the guider's mean; ``None`` for none
-    :param shared_std: policy whose standard deviation both have, "learner" or "guider"; the other borrows it as a constant.
-        "auto" is the guider's, the paper's, unless the guider is relative to the learner and that has an entropy term
-    :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto" is 1,
-        the paper's, and 0 with a residual guider, whose KL does not depend on the learner: a pull towards it closes no gap,
-        and the learner chases what moves along with it
-    :param guidance: weight of the KL in the learner's objective apart from ``kl_coef``, in units of the mean |Q| that it
-        climbs, as TD3+BC weighs imitation; a number or a schedule. It pulls the learner where the guider is far, and
-        ``kl_coef`` therefore small, as hard as where it is near
-    :param learner_entropy: SAC's entropy term in the learner's objective and critics; False for eqs. 15 and 16 as printed,
-        where nothing but the KL keeps the learner's mean from growing
+    :param kl_reduction: reduction of the KL over action dimensions, "mean" or "sum"
+    :param guider: kind of guider: "residual", the learner plus a privileged correction; "lagged", the learner's Polyak average
+        plus a privileged correction; "independent", a network of its own (the paper's)
+    :param max_kl: hard bound on the KL in every state, held by projecting the guider's mean; ``None`` for none
+    :param shared_std: policy whose standard deviation both policies have, "learner" or "guider"; the other policy borrows it
+        as a constant. "auto" is "learner" if the guider is relative to the learner and the learner has an entropy term, else
+        "guider", the paper's
+    :param learner_kl_scale: weight of the KL in the learner's objective (eq. 16), as a multiple of ``kl_coef``; "auto" is 0
+        with a residual guider, whose KL does not depend on the learner, so that a pull towards it closes no gap; with other
+        guiders "auto" is 1, the paper's
+    :param guidance: weight of a KL term of the learner's objective that does not depend on ``kl_coef``, in units of the mean
+        |Q| of the critics that the learner climbs, as TD3+BC weighs imitation; a number or a schedule. Where the guider is far
+        from the learner, ``kl_coef`` is small, and this term still pulls as hard as elsewhere
+    :param learner_entropy: whether the learner's objective and critics have SAC's entropy term; False for eqs. 15 and 16 as
+        printed, where nothing but the KL keeps the learner's mean from growing
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -197,7 +199,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
         }
 
     def make_coefficients(self) -> dict[str, Coefficient]:
-        """The entropy temperature, and the weight of the KL."""
+        """The entropy temperature and the weight of the KL."""
         self.target_kl_schedule = PlainSchedule(AUTO_TARGET_KL if self.target_kl == "auto" else self.target_kl)
         self.guidance_schedule = PlainSchedule(self.guidance)
         self.target_kl_tensor, self.guidance_tensor = (th.zeros((), device=self.device) for _ in range(2))
@@ -210,10 +212,14 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
 
     def update(self, batch: Batch) -> Metrics:
         """
-        Algorithm 1; the targets follow in :meth:`train`.
+        One gradient step of Algorithm 1; :meth:`train` then moves the target networks.
 
-        In all losses ``guider`` and ``learner`` are what the two networks computed for the batch before anything was changed,
-        alpha is the KL's coefficient, beta the entropy's, and ``noise`` is standard normal, of the actions' shape.
+        In all losses ``guider`` and ``learner`` are the outputs of the two networks for the batch before any parameter was
+        changed, alpha is the coefficient of the KL, beta is the entropy temperature, and ``noise`` is standard normal and has
+        the actions' shape.
+
+        :param batch: transitions, or sequences of them
+        :return: metrics to log under "train/"
         """
         alpha, beta = self.coefficients["kl_coef"].value, self.coefficients["ent_coef"].value
         noise = th.randn((4, *batch.actions.shape), device=self.device)
@@ -233,7 +239,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
     def guider_critic_loss(
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
     ) -> Loss:
-        """Eq. 12: the guider's return, less what it pays for its distance to the learner."""
+        """Eq. 12: the guided critics fit the guider's return, less alpha times its KL to the learner."""
         with th.no_grad():
             later = self.policy.action_distributions(guider.later, learner.later)
             next_q, log_prob = later.guider.value_and_log_prob(batch.q_at_next_obs(self.policy.guider_critic_target), noise)
@@ -244,7 +250,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
     def guider_loss(
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
     ) -> Loss:
-        """Eq. 13: climb the guided critics, close to the learner as it is."""
+        """Eq. 13: the guider climbs the guided critics and pays for its KL to the learner, which is a constant here."""
         now = self.policy.action_distributions(guider.now, learner.now.detach())
         q, log_prob = now.guider.value_and_log_prob(batch.q_at_obs(self.policy.guider_critic), noise)
         kl = now.guider.kl_of_means(now.learner, self.kl_reduction)
@@ -263,7 +269,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
     # --- the learner ------------------------------------------------------------------------------------------------
 
     def learner_critic_loss(self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, beta: th.Tensor) -> Loss:
-        """Eq. 15: the learner's own return."""
+        """Eq. 15: the learner's critics fit the learner's own return."""
         with th.no_grad():
             policy = self.policy.action_distributions(guider.later, learner.later).learner
             next_q, log_prob = policy.value_and_log_prob(batch.q_at_next_obs(self.policy.critic_target), noise)
@@ -273,7 +279,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
     def learner_loss(
         self, batch: Batch, guider: Outputs, learner: Outputs, noise: th.Tensor, alpha: th.Tensor, beta: th.Tensor
     ) -> Loss:
-        """Eq. 16, with the learner's critics, or the guided ones where it has none."""
+        """Eq. 16: the learner climbs its own critics, or the guided critics where it has none of its own."""
         now = self.policy.action_distributions(guider.now.detach(), learner.now)
         q, log_prob = now.learner.value_and_log_prob(batch.q_at_obs(self.policy.critic), noise)
         terms = {"q": q, "log_prob": log_prob, "ent_coef": beta * self.learner_entropy}
@@ -283,16 +289,16 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
         return self._with_deployment_losses(policy_loss(**terms, mask=batch.mask), now, batch.mask)
 
     def _learner_kl_coef(self, alpha: th.Tensor, q: th.Tensor, mask: th.Tensor | None) -> th.Tensor:
-        """Alpha times ``learner_kl_scale``, and ``guidance`` in units of the values that the learner climbs."""
+        """Weight of the KL: alpha times ``learner_kl_scale``, plus ``guidance`` in units of the critics' mean |Q|."""
         weight = self.learner_kl_weight * alpha
         return weight + self.guidance_tensor * masked_mean(q.amin(dim=0).abs(), mask) if self.is_guided else weight
 
     def _with_deployment_losses(self, loss: th.Tensor, now: ActionDistributions, mask: th.Tensor | None) -> Loss:
         """
-        :param loss: of the learner
-        :param now: the policies at the observations, with the learner's gradient
-        :param mask: of the batch
-        :return: the loss with the fit of what serves at deployment alone, and what is to be logged
+        :param loss: the learner's loss, scalar
+        :param now: action distributions at the observations, with the learner's gradient
+        :param mask: the batch's mask, shape (T, B), or ``None``
+        :return: the loss plus the losses of parameters that serve at deployment only, with the metrics to log
         """
         fits = self.policy.learner.deployment_losses(now.deployed, now.learner, mask)
         seen = {f"learner_{name}": masked_mean(values, mask) for name, values in now.learner.diagnostics().items()}
@@ -302,15 +308,15 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
 
     @property
     def current_target_kl(self) -> float:
-        """The bound on KL at this point of training."""
+        """The bound on the KL at the present point of training."""
         return self.auto_target_kl if self.target_kl == "auto" else self.target_kl_schedule(self._current_progress_remaining)
 
     def compare(self, difference: float) -> None:
         """
-        With ``target_kl="auto"``, the guider may go further while its episodes return more than the learner's own, and must
-        come nearer when they do not, as Teacher-Guided RL moves its teacher's weight.
+        Move the bound of ``target_kl="auto"``, as Teacher-Guided RL moves the weight of its teacher: the guider may go further
+        from the learner if its episodes return more than the learner's own, and must come nearer if they return less.
 
-        :param difference: mean return of the guider's latest episodes, less that of the learner's own
+        :param difference: mean return of the guider's latest episodes, less the mean return of the learner's own
         """
         self.logger.record("rollout/guider_minus_learner", difference)
         low, high = AUTO_TARGET_KL_BOUNDS
@@ -318,7 +324,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
         self.auto_target_kl = min(max(moved, low), high)
 
     def training_state(self) -> dict[str, Any]:
-        """See :meth:`ResumableAlgorithm.training_state`."""
+        """State of the training that checkpoints keep, see :meth:`ResumableAlgorithm.training_state`."""
         return super().training_state() | {"auto_target_kl": self.auto_target_kl}
 
     @property
@@ -328,7 +334,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
 
     @property
     def is_guided(self) -> bool:
-        """Whether ``guidance`` is anything but 0 throughout."""
+        """Whether ``guidance`` is a schedule or a number other than 0."""
         return callable(as_schedule(self.guidance)) or float(self.guidance) != 0  # type: ignore[arg-type]
 
     def _auto_learner_kl_weight(self) -> float:

@@ -19,12 +19,12 @@ SHARED_STDS = ("learner", "guider")
 
 class ActionDistributions(NamedTuple):
     """
-    Both policies for one batch.
+    The action distributions of both policies for one batch.
 
-    :param guider: shapes (B, A)
-    :param learner: as it is in training, shapes (B, A); Gaussians have one std, which is a constant in that of the two
-        that borrows it
-    :param deployed: the learner by itself, shapes (B, A)
+    :param guider: the guider's distribution, shapes (B, A)
+    :param learner: the learner's distribution in training, shapes (B, A); Gaussians of guider and learner have one std, which
+        is a constant in the distribution that borrows it
+    :param deployed: the learner's distribution at deployment, with a std of its own, shapes (B, A)
     """
 
     guider: Any
@@ -34,17 +34,18 @@ class ActionDistributions(NamedTuple):
 
 class GACPolicy(AsymmetricPolicy):
     """
-    All networks of GAC and their optimisers. As a policy it is the learner: ``predict`` needs its entries alone.
+    All networks of GAC and their optimisers. As a policy it is the learner: ``predict`` needs the learner's entries alone.
 
     Arguments that are not described here are those of :class:`AsymmetricPolicy`.
 
-    :param net_arch: hidden layer sizes: one list, ``{"pi", "qf"}`` or ``{"guider", "learner", "critic"}``
-    :param guider: "residual", "lagged" or "independent", a key of ``GUIDERS``
-    :param max_kl: hard bound on KL(guider || learner), or ``None``
-    :param kl_reduction: how that KL is reduced over action dimensions, "mean" or "sum"
+    :param net_arch: hidden layer sizes: one list for all networks, or a dict of lists with the keys "pi" and "qf", or with the
+        keys "guider", "learner" and "critic"
+    :param guider: kind of guider, a key of ``GUIDERS``: "residual", "lagged" or "independent"
+    :param max_kl: hard bound on KL(guider || learner) in every state; ``None`` for none
+    :param kl_reduction: reduction of that KL over action dimensions, "mean" or "sum"
     :param learner_critics: whether the learner has critics of its own
-    :param shared_std: whose std both Gaussians have, one of ``SHARED_STDS``; what the other's network says of its own counts
-        at most at deployment
+    :param shared_std: policy whose std both Gaussians have in training, one of ``SHARED_STDS``; the other network's own std
+        serves at most at deployment
     """
 
     learner_critic: CriticEnsemble | None
@@ -83,17 +84,17 @@ class GACPolicy(AsymmetricPolicy):
         super().__init__(observation_space, action_space, lr_schedule, net_arch, activation_fn, **kwargs)
 
     def own_options(self) -> dict[str, Any]:
-        """See :meth:`AsymmetricPolicy.own_options`."""
+        """Constructor arguments of this class alone, see :meth:`AsymmetricPolicy.own_options`."""
         return self.own
 
     def make_policy(self, role: str, **arguments: Any) -> RolePolicy:
-        """See :meth:`AsymmetricPolicy.make_policy`."""
+        """The network of the learner or of the guider, see :meth:`AsymmetricPolicy.make_policy`."""
         if role == "learner":
             return Learner(**arguments, owns_std=self.owns_std)
         return self.guider_class(**arguments, **self.guider_options)
 
     def tie_networks(self) -> None:
-        """See :meth:`AsymmetricPolicy.tie_networks`."""
+        """Give a lagged guider the learner's target network, see :meth:`AsymmetricPolicy.tie_networks`."""
         if isinstance(self.guider, LaggedGuider):
             if self.remembers:
                 raise ValueError(
@@ -103,48 +104,50 @@ class GACPolicy(AsymmetricPolicy):
             self.guider.follow(self.learner_target)
 
     def has(self, role: str) -> bool:
-        """See :meth:`AsymmetricPolicy.has`."""
+        """Whether there is a network for the role: the learner's critics may be missing, see :meth:`AsymmetricPolicy.has`."""
         return role != "learner_critic" or self.learner_critics
 
     def unclipped(self, role: str) -> int:
-        """See :meth:`AsymmetricPolicy.unclipped`; the learner's std, where it serves at deployment only."""
+        """Number of parameters that gradient clipping leaves out: the learner's std, where it serves at deployment only."""
         return len(self.learner.deployment_parameters()) if role == "learner" else 0
 
     @property
     def actor(self) -> LearnerAsActor:
-        """SB3's name for the policy that acts at evaluation; called, it returns actions."""
+        """SB3's name for the policy that acts at evaluation; a call returns actions."""
         return LearnerAsActor.of(self.learner)
 
     @property
     def critic(self) -> CriticEnsemble:
-        """SB3's name for the critic without the KL term (eq. 15); the guided one in ablations that have no other."""
+        """SB3's name for the learner's critics (eq. 15); the guided critics in ablations that have no others."""
         return self.guider_critic if self.learner_critic is None else self.learner_critic
 
     @property
     def critic_target(self) -> CriticEnsemble:
-        """Target of :attr:`critic`."""
+        """Target network of :attr:`critic`."""
         return self.guider_critic_target if self.learner_critic_target is None else self.learner_critic_target
 
     @property
     def side_branch(self) -> tuple[str, ...]:
-        """The guider's, unless the learner climbs the guided critics."""
+        """The guider and its critics, whose steps may run beside the learner's, unless the learner climbs these critics."""
         independent = self.learner_critic is not None and not self.share_features_extractor
         return ("guider", "guider_critic") if independent else ()
 
     def distributions(self, obs: PyTorchObs) -> ActionDistributions:
         """
-        Both policies' action distributions for one batch.
+        The action distributions of both policies for one batch.
 
-        :param obs: full observation, B of each entry
-        :return: shapes (B, A)
+        :param obs: full observation, (B, ...) of each entry
+        :return: distributions of guider and learner, shapes (B, A)
         """
         return self.action_distributions(self.guider.distribution(obs), self.learner.distribution(obs))
 
     def action_distributions(self, guider_output: Distribution, learner_output: Distribution) -> ActionDistributions:
         """
-        :param guider_output: of the guider's network, for some batch
-        :param learner_output: of the learner's network, for the same batch
-        :return: shapes (B, A)
+        The action distributions of both policies, from the outputs of their networks.
+
+        :param guider_output: output of the guider's network for a batch
+        :param learner_output: output of the learner's network for the same batch
+        :return: distributions of guider and learner, shapes (B, A)
         """
         guider: Any = guider_output
         learner: Any = learner_output
@@ -154,19 +157,19 @@ class GACPolicy(AsymmetricPolicy):
         return ActionDistributions(guider, learner.with_std_of(guider), learner)
 
     def acting_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:
-        """See :meth:`AsymmetricPolicy.acting_distributions`."""
+        """The distributions that guider and deployed learner act by, see :meth:`AsymmetricPolicy.acting_distributions`."""
         both = self.action_distributions(outputs["guider"], outputs["learner"])
         return {"guider": both.guider, "learner": both.deployed}
 
 
 class GACGruPolicy(GACPolicy):
-    """All networks with a GRU each."""
+    """The policy of :class:`GACPolicy` with a GRU in each network."""
 
     default_rnn_type = "gru"
 
 
 class GACLstmPolicy(GACPolicy):
-    """All networks with an LSTM each."""
+    """The policy of :class:`GACPolicy` with an LSTM in each network."""
 
     default_rnn_type = "lstm"
 

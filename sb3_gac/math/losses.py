@@ -14,10 +14,10 @@ alpha, ``kl_coef``     weight of KL(mu || pi), dual variable of KL <= target_kl 
 beta, ``ent_coef``     entropy temperature, dual variable of the entropy bound     ()
 =====================  ==========================================================  ===========
 
-``*E`` is any number of leading batch dimensions, (B,) for one-step batches and (T, B) for sequences.  An optional
+``*E`` stands for the leading batch dimensions, (B,) for batches of transitions and (T, B) for sequences.  An optional
 ``mask`` of that shape (1 valid, 0 padding) leaves padding out of every average.  Equation numbers are those of the
-Guided Actor-Critic paper.  Whatever must not receive a gradient (targets, frozen critics, the other policy) is
-detached by the caller, except in the dual loss, whose violation is always a constant.
+Guided Actor-Critic paper.  The caller detaches all that must not receive a gradient (targets, frozen critics, the other
+policy), except for the violation in the dual loss, which is always treated as a constant.
 """
 
 import math
@@ -28,11 +28,11 @@ import torch.nn.functional as F
 
 def masked_mean(values: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
     """
-    Average over all leading dimensions, padding left out.
+    The average over all leading dimensions, without padding.
 
-    :param values: shape (\\*E)
-    :param mask: shape (\\*E), 1 for valid entries and 0 for padding; ``None`` if all are valid
-    :return: scalar
+    :param values: values to average, shape (\\*E)
+    :param mask: 1 for valid values and 0 for padding, shape (\\*E); ``None`` if all are valid
+    :return: average, scalar
     """
     if mask is None:
         return values.mean()
@@ -41,12 +41,12 @@ def masked_mean(values: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
 
 def masked_quantile(values: th.Tensor, share: float, mask: th.Tensor | None = None) -> th.Tensor:
     """
-    Smallest value that at least a share of all values do not exceed, padding left out.
+    The smallest value that at least a share of all values do not exceed, without padding.
 
-    :param values: shape (\\*E)
-    :param share: in (0, 1]
-    :param mask: shape (\\*E), 1 for valid entries and 0 for padding; ``None`` if all are valid
-    :return: scalar
+    :param values: values whose quantile is taken, shape (\\*E)
+    :param share: share of the values, in (0, 1]
+    :param mask: 1 for valid values and 0 for padding, shape (\\*E); ``None`` if all are valid
+    :return: quantile, scalar
     """
     if mask is None:
         return values.flatten().kthvalue(math.ceil(share * values.numel())).values
@@ -70,19 +70,19 @@ def soft_target(
     """
     Bellman target of a policy's critics: the return of eq. 15, with SAC's entropy term and eq. 12's KL term on request.
 
-    The expectation over a' of log mu - log pi in eq. 12 is the KL divergence itself, so its closed form replaces the sampled
-    ratio of the printed equation: less variance, never negative.
+    The expectation over a' of log mu - log pi in eq. 12 is the KL divergence itself, so the closed form of the KL replaces the
+    sampled ratio of the printed equation: it has less variance and is never negative.
 
-    :param reward: shape (\\*E)
-    :param done: 1 where the episode terminated (a time limit is not a termination), shape (\\*E)
-    :param next_q: target critics at (s', a'), a' from the policy, shape (N, \\*E)
-    :param discount: gamma, or gamma to the number of steps between s and s', scalar or (\\*E)
+    :param reward: reward of each transition, shape (\\*E)
+    :param done: 1 where the episode terminated (a time limit is no termination), else 0, shape (\\*E)
+    :param next_q: values of target critics at (s', a'), a' from the policy, shape (N, \\*E)
+    :param discount: gamma to the power of the number of steps between s and s', scalar or shape (\\*E)
     :param next_log_prob: log-probability of a', shape (\\*E)
-    :param ent_coef: beta
+    :param ent_coef: entropy temperature beta, scalar
     :param next_kl: KL(mu(.|s') || pi(.|o')), shape (\\*E)
-    :param kl_coef: alpha
-    :return: shape (\\*E)
-    :raises ValueError: naming the tensor whose shape is not (\\*E)
+    :param kl_coef: weight alpha of the KL, scalar
+    :return: Bellman target of each transition, shape (\\*E)
+    :raises ValueError: if the shape of a tensor is not (\\*E); the message names the tensor
     """
     _check_shapes(next_q.shape[1:], reward=reward, done=done, discount=discount, next_log_prob=next_log_prob, next_kl=next_kl)
     next_value = next_q.amin(dim=0) - kl_coef * next_kl - ent_coef * next_log_prob
@@ -93,11 +93,12 @@ def critic_loss(q: th.Tensor, target: th.Tensor, mask: th.Tensor | None = None, 
     """
     Squared Bellman residual of an ensemble (eqs. 12 and 15): half the mean square, summed over the critics.
 
-    :param q: shape (N, \\*E)
-    :param target: shape (\\*E), detached
-    :param mask: shape (\\*E)
-    :param weights: of the squares, shape (\\*E): what has none counts in the mean, as nothing; ``None`` where all are 1
-    :return: scalar
+    :param q: values of the critics at (s, a), shape (N, \\*E)
+    :param target: Bellman target, detached, shape (\\*E), or (N, \\*E) with a target for each critic
+    :param mask: 1 for valid steps and 0 for padding, shape (\\*E); ``None`` if all are valid
+    :param weights: weights of the squares, shape (\\*E); a square of weight 0 still counts in the number that the mean divides
+        by. ``None`` if all weights are 1
+    :return: loss, scalar
     """
     if weights is not None:
         return 0.5 * masked_mean((q - target).square().sum(dim=0) * weights, mask)
@@ -116,17 +117,17 @@ def policy_loss(
     mask: th.Tensor | None = None,
 ) -> th.Tensor:
     """
-    A policy's objective: climb its critics, with SAC's entropy term and a KL term on request. It is the guider's (eq. 13)
-    with KL(mu || sg pi), and the learner's (eq. 16) with KL(sg mu || pi).
+    A policy's loss: the policy climbs its critics, with SAC's entropy term and a KL term on request. With KL(mu || sg pi) the
+    loss is the guider's (eq. 13), with KL(sg mu || pi) the learner's (eq. 16); sg stands for a stopped gradient.
 
-    :param q: critics at (s, a), a from the policy and reparameterised, frozen, shape (N, \\*E)
+    :param q: values of frozen critics at (s, a), a from the policy and reparameterised, shape (N, \\*E)
     :param log_prob: log-probability of a, shape (\\*E)
-    :param ent_coef: beta
-    :param kl: divergence of the two policies, shape (\\*E)
-    :param kl_coef: alpha
-    :param mask: shape (\\*E)
-    :return: scalar
-    :raises ValueError: naming the tensor whose shape is not (\\*E)
+    :param ent_coef: entropy temperature beta, scalar
+    :param kl: KL divergence of the two policies, shape (\\*E)
+    :param kl_coef: weight alpha of the KL, scalar
+    :param mask: 1 for valid steps and 0 for padding, shape (\\*E); ``None`` if all are valid
+    :return: loss, scalar
+    :raises ValueError: if the shape of a tensor is not (\\*E); the message names the tensor
     """
     _check_shapes(q.shape[1:], log_prob=log_prob, kl=kl, mask=mask)
     return masked_mean(kl_coef * kl + ent_coef * log_prob - q.amin(dim=0), mask)
@@ -138,12 +139,13 @@ def clipped_surrogate(
     """
     PPO's objective (Schulman et al. 2017, arXiv 1707.06347, eq. 7), as a loss.
 
-    :param log_ratio: of an action's probability to that under the policy which took it, shape (B,)
-    :param advantages: of the actions, shape (B,)
-    :param epsilon: how far from one the clipped ratio may be, scalar
-    :param clipped_from: logarithm of what is clipped, where that is not the ratio itself, shape (B,)
-    :return: scalar
-    :raises ValueError: naming the tensor whose shape is not (B,)
+    :param log_ratio: logarithm of the ratio of an action's probability to its probability under the policy that took it, shape
+        (B,)
+    :param advantages: advantages of the actions, shape (B,)
+    :param epsilon: largest distance of the clipped ratio from 1, scalar
+    :param clipped_from: logarithm of the ratio that is clipped, shape (B,); ``None`` to clip the ratio of ``log_ratio`` itself
+    :return: loss, scalar
+    :raises ValueError: if the shape of a tensor is not (B,); the message names the tensor
     """
     _check_shapes(log_ratio.shape, advantages=advantages, clipped_from=clipped_from)
     clipped = (log_ratio if clipped_from is None else clipped_from).exp().clamp(1 - epsilon, 1 + epsilon)
@@ -152,48 +154,48 @@ def clipped_surrogate(
 
 def distillation_loss(kl: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
     """
-    Learner objective without reinforcement learning (eq. 14).
+    The learner's loss without reinforcement learning (eq. 14).
 
     :param kl: KL(sg mu || pi), shape (\\*E)
-    :param mask: shape (\\*E)
-    :return: scalar
+    :param mask: 1 for valid steps and 0 for padding, shape (\\*E); ``None`` if all are valid
+    :return: loss, scalar
     """
     return masked_mean(kl, mask)
 
 
 def log_std_loss(log_std: th.Tensor, guider_log_std: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
     """
-    Fit of the learner's own log standard deviation, used at deployment only, to the guider's.
+    The loss that fits the learner's own log standard deviation, used at deployment only, to the guider's.
 
-    :param log_std: shape (\\*E, A)
-    :param guider_log_std: shape (\\*E, A), detached
-    :param mask: shape (\\*E)
-    :return: scalar
+    :param log_std: the learner's own log standard deviation, shape (\\*E, A)
+    :param guider_log_std: the guider's log standard deviation, detached, shape (\\*E, A)
+    :param mask: 1 for valid steps and 0 for padding, shape (\\*E); ``None`` if all are valid
+    :return: half the mean squared difference, scalar
     """
     return 0.5 * masked_mean((log_std - guider_log_std).square().mean(dim=-1), mask)
 
 
 def dual_loss(coefficient: th.Tensor, violation: th.Tensor) -> th.Tensor:
     """
-    Loss of dual variables; a coefficient rises exactly while its constraint is violated.
+    The loss of dual variables: a coefficient rises exactly while its constraint is violated.
 
-    For alpha (eq. 17, with the sign its text describes) the violation is KL - target_kl; for SAC's beta it is
-    log mu + target_entropy.
+    The violation is KL - target_kl for alpha (eq. 17, with the sign that its text describes), and log mu + target_entropy for
+    SAC's beta.
 
-    :param coefficient: shape (), (1,) or, one for each action dimension, (A,)
-    :param violation: mean over the batch, of the same shape or a scalar; treated as a constant
-    :return: scalar
+    :param coefficient: dual variable, shape () or (1,), or (A,) with one for each action dimension
+    :param violation: mean violation over the batch, of the same shape or a scalar; treated as a constant
+    :return: loss, scalar
     """
     return -(coefficient * violation.detach()).sum()
 
 
 def _check_shapes(expected: th.Size, **tensors: th.Tensor | float | None) -> None:
     """
-    Broadcasting would make a wrong shape a wrong number.
+    Check shapes, since broadcasting would turn a wrong shape into a wrong number.
 
-    :param expected: of all tensors but scalars
-    :param tensors: name -> tensor, or a number
-    :raises ValueError: naming the one that has another shape
+    :param expected: shape that all tensors must have, except for scalars
+    :param tensors: name -> tensor, number or ``None``
+    :raises ValueError: if a tensor has another shape; the message names the tensor
     """
     for name, tensor in tensors.items():
         if isinstance(tensor, th.Tensor) and tensor.dim() > 0 and tensor.shape != expected:

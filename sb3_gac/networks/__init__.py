@@ -1,1 +1,1 @@
-"""What is between observations and numbers: encoders, memories, heads, critics, policy networks."""
+"""Networks: encoders, memories, heads, critics and policy networks."""

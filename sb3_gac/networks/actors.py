@@ -1,4 +1,4 @@
-"""Policy networks on the entries of one role: the base of all, and of those that are deployed."""
+"""Policy networks on the entries of one role: the base of all policies, and that of deployed policies."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,14 +19,15 @@ from sb3_gac.networks.role_model import RoleModel
 
 
 class BoundedPolicy(BasePolicy):
-    """A policy whose actions, scaled to the environment's range, stay in it."""
+    """A policy whose actions never leave the environment's range."""
 
     def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
         """
-        See SB3's ``unscale_action``; here rounding does not lead beyond the upper bound.
+        Scale actions to the environment's range, as SB3's ``unscale_action`` does, but without exceeding the upper bound by
+        rounding.
 
-        :param scaled_action: in [-1, 1], shape (..., \\*action shape)
-        :return: in the environment's range
+        :param scaled_action: actions in [-1, 1], shape (..., \\*action shape)
+        :return: actions in the environment's range, of the same shape
         """
         return np.minimum(super().unscale_action(scaled_action), self.action_space.high)  # type: ignore[attr-defined]
 
@@ -35,18 +36,19 @@ class RolePolicy(RoleModel, BoundedPolicy):
     """
     A policy network on the entries of its role: encoder, hidden layers, and the head that fits the actions.
 
-    :param observation_space: the entries that this role reads
-    :param action_space: Box or Discrete
+    :param observation_space: space of the entries that this role reads
+    :param action_space: Box or Discrete space of actions
     :param net_arch: hidden layer sizes
     :param features_extractor: encoder of the entries
-    :param features_dim: its output size
-    :param activation_fn: between layers
-    :param normalize_images: divide images by 255
-    :param rest_extractor: encoder of the entries that the deployed policy does not read, if
-        ``features_extractor`` is the deployed policy's and this is another role
+    :param features_dim: number of features that go into the hidden layers
+    :param activation_fn: activation after each hidden layer
+    :param normalize_images: whether images are divided by 255
+    :param rest_extractor: encoder of the entries that the deployed policy does not read, if ``features_extractor`` is the
+        deployed policy's and this network is another role's; else ``None``
     :param log_std_bounds: smallest and largest log standard deviation before tanh
-    :param softplus_min_std: see :func:`sb3_gac.networks.heads.make_head`
-    :param memory: of the entries, for sequences; ``features_dim`` is then its output size
+    :param softplus_min_std: smallest standard deviation of a head with softplus, see :func:`sb3_gac.networks.heads.make_head`;
+        ``None`` for a head with exp
+    :param memory: memory between encoder and hidden layers; ``features_dim`` is then its output size. ``None`` for none
     """
 
     features_extractor: BaseFeaturesExtractor
@@ -86,30 +88,34 @@ class RolePolicy(RoleModel, BoundedPolicy):
         self.head = make_head(latent_dim, action_space, log_std_bounds, softplus_min_std)
 
     def forward(self, obs: PyTorchObs) -> Distribution:
-        """See :meth:`distribution`."""
+        """The output of the network, see :meth:`distribution`."""
         return self.distribution(obs)
 
     def distribution(self, obs: PyTorchObs) -> Distribution:
         r"""
-        What the network computes; with a memory, of sequences from an episode's start on.
+        The output of the network; with a memory, the observations are sequences from an episode's start on.
 
         :param obs: observation with at least the entries of this role, (\*E, ...) of each
-        :return: distribution of actions, or of what makes them, shapes (\*E, A)
+        :return: distribution of actions, or, for a residual guider, of corrections, shapes (\*E, A)
         """
         return self.output(self.latent(obs))
 
     def latent(self, obs: PyTorchObs) -> th.Tensor:
         r"""
+        The last hidden layer of the network.
+
         :param obs: observation with at least the entries of this role, (\*E, ...) of each
-        :return: last hidden layer, shape (\*E, H)
+        :return: activations of the last hidden layer, shape (\*E, H)
         """
         features = self.extract_features(obs, self.features_extractor)
         return self.latent_net(features if self.memory is None else self.memory(features)[0][0])
 
     def output(self, latent: th.Tensor) -> Distribution:
         r"""
-        :param latent: shape (\*E, H)
-        :return: see :meth:`distribution`
+        The output of the head.
+
+        :param latent: activations of the last hidden layer, shape (\*E, H)
+        :return: distribution that :meth:`distribution` describes, shapes (\*E, A)
         """
         return self.head(latent)
 
@@ -117,13 +123,13 @@ class RolePolicy(RoleModel, BoundedPolicy):
         self, obs: PyTorchObs, state: np.ndarray | None, episode_start: np.ndarray | None
     ) -> tuple[Distribution, np.ndarray | None]:
         """
-        One step of acting.
+        One step of acting, with the memory's state carried along.
 
         :param obs: observation with at least the entries of this role, (B, ...) of each
-        :param state: what was remembered before, shape (B, S), or ``None``
-        :param episode_start: true where an episode starts, shape (B,)
-        :return: as of :meth:`distribution`, shapes (B, A), and what is remembered now, but for the action, see
-            :meth:`with_action`; ``None`` without a memory
+        :param state: state of the memory before the step, shape (B, S); ``None`` at an episode's start or without a memory
+        :param episode_start: true where an episode starts, shape (B,); ``None`` if no episode starts
+        :return: output of :meth:`distribution`, shapes (B, A), and state of the memory after the step, which
+            :meth:`with_action` completes, shape (B, S); ``None`` without a memory
         """
         if self.memory is None:
             return self.distribution(obs), None
@@ -136,9 +142,12 @@ class RolePolicy(RoleModel, BoundedPolicy):
 
     def with_action(self, state: np.ndarray | None, actions: np.ndarray) -> np.ndarray | None:
         r"""
-        :param state: what :meth:`remember` returned
-        :param actions: that were then taken, in [-1, 1], shape (B, \*action shape), or numbers of actions
-        :return: what is remembered of both, for the next step
+        Add the actions of a step to the memory's state.
+
+        :param state: state that :meth:`remember` returned, shape (B, S), or ``None``
+        :param actions: actions taken in that step, in [-1, 1], shape (B, \*action shape), or numbers of discrete actions,
+            shape (B,)
+        :return: state for the next step, shape (B, S); ``None`` without a memory
         """
         if self.memory is None or state is None:
             return state
@@ -158,14 +167,17 @@ class RolePolicy(RoleModel, BoundedPolicy):
 
 
 class DeployedPolicy(RolePolicy):
-    """The policy that ``predict`` stands for: it needs its own entries and ignores all others."""
+    """A policy that can be deployed: ``predict`` needs the entries of its role alone, and ignores all others."""
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """
-        :param observation: single or batched; a dict with at least the policy's entries, or, where the policy
-            reads one entry, that entry alone
-        :return: tensors of the policy's entries, and whether they were batched
-        :raises ValueError: naming the entry that is missing, does not fit its space, or is not as many as the others
+        Tensors of the entries that the policy reads.
+
+        :param observation: one observation or a batch: a dict with at least the policy's entries, or, if the policy reads one
+            entry, an array of that entry
+        :return: tensors of the policy's entries, (B, ...) of each, and whether the observation was a batch
+        :raises ValueError: if an entry is missing, does not fit its space, or has another batch size than the others; the
+            message names the entry
         """
         return self.reader.read(self._own_entries(observation), self.device)
 
@@ -190,11 +202,13 @@ class DeployedPolicy(RolePolicy):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        :param observation: see :meth:`obs_to_tensor`
-        :param state: what the last call returned, ``None`` at the start
+        The policy's actions.
+
+        :param observation: one observation or a batch, see :meth:`obs_to_tensor`
+        :param state: state that the last call returned; ``None`` at the start
         :param episode_start: true where an episode starts, shape (B,)
-        :param deterministic: mode instead of a sample
-        :return: action in the environment's range, and the state for the next call
+        :param deterministic: whether the action is the distribution's mode instead of a sample
+        :return: actions in the environment's range, and the state for the next call, ``None`` without a memory
         """
         if self.memory is None:
             return super().predict(observation, state, episode_start, deterministic)
@@ -220,9 +234,11 @@ class Actor(DeployedPolicy):
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:  # type: ignore[override]
         """
-        :param obs: observation with at least the policy's entries, (B, ...) of each; for a policy with a memory, those of
-            an episode's first step
-        :param deterministic: mode instead of a sample, which is differentiable where actions are continuous
-        :return: actions in [-1, 1], shape (B, A), or numbers of actions, shape (B,)
+        The policy's actions, on the network's scale; samples of continuous actions are differentiable.
+
+        :param obs: observation with at least the policy's entries, (B, ...) of each; for a policy with a memory, observations
+            of episodes' first steps
+        :param deterministic: whether the action is the distribution's mode instead of a sample
+        :return: actions in [-1, 1], shape (B, A), or numbers of discrete actions, shape (B,)
         """
         return self._predict(obs, deterministic)

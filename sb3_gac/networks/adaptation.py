@@ -1,4 +1,4 @@
-"""An estimate of what is not seen, from the last observations and actions: RMA's adaptation module, as a memory."""
+"""RMA's adaptation module as a memory: it estimates a latent of unseen entries from the last observations and actions."""
 
 import itertools
 
@@ -10,23 +10,24 @@ from sb3_gac.networks.layers import Head
 from sb3_gac.networks.recurrent import Memory
 
 WIDTH = 32
-#: Kernel size and stride of the convolutions over time
+#: Kernel size and stride of each convolution over time, in steps
 CONVOLUTIONS = ((9, 2), (5, 1), (5, 1))
 
 
 class Adaptation(Memory):
     """
-    Remembers the last K pairs of an observation's features and the action that followed, and estimates a latent from them:
-    two layers for each pair, convolutions over time, and a linear layer (Kumar et al. 2021, arXiv 2107.04034). Pairs before
-    an episode's start are zeros. A convolution that is longer than what is left of the K pairs is left out, with K = 1 all.
+    A memory of the last K pairs of an observation's features and the action that followed, and an estimate of a latent from
+    these pairs: two layers for each pair, convolutions over time, and a linear layer (Kumar et al. 2021, arXiv 2107.04034).
+    Pairs before an episode's start are zeros. A convolution that is longer than its input is left out; with K = 1 all are left
+    out.
 
-    As a policy's memory it puts the estimate beside the features.
+    A policy with this memory gets the estimate beside the features of the present observation.
 
-    :param features_dim: of an observation, F
-    :param action_space: Box, of A dimensions, or Discrete, of A actions
-    :param length: pairs, K
+    :param features_dim: number of features of an observation, F
+    :param action_space: Box of A dimensions, or Discrete space of A actions
+    :param length: number of pairs, K
     :param latent_dim: size of the estimate, L
-    :param activation_fn: between layers
+    :param activation_fn: activation after each layer but the last
     """
 
     def __init__(
@@ -54,11 +55,11 @@ class Adaptation(Memory):
 
     def forward(self, features: th.Tensor, state: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
         """
-        One step of acting; the action is still to come, see :meth:`with_action`.
+        One step of acting; :meth:`with_action` then adds the action to the state.
 
-        :param features: of one step, shape (1, B, F)
-        :param state: before it, shape (1, B, S); ``None`` at an episode's start
-        :return: features and estimate, shape (1, 1, B, F + L), and the state after it
+        :param features: features of the step's observation, shape (1, B, F)
+        :param state: state before the step, shape (1, B, S); ``None`` at an episode's start
+        :return: features and estimate side by side, shape (1, 1, B, F + L), and state after the step, shape (1, B, S)
         """
         now = features[0]
         before = now.new_zeros(len(now), self.state_size) if state is None else state[0]
@@ -66,26 +67,26 @@ class Adaptation(Memory):
         return th.cat([now, self.estimate(before)], dim=-1)[None, None], after[None]
 
     def with_action(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """See :meth:`Memory.with_action`."""
+        """The state with the action of the last step, see :meth:`Memory.with_action`."""
         actions = actions.reshape(-1, 1 if self.n_choices else self.action_dim)
         return th.cat([state[:, : -self.action_dim], self._encoded(actions).to(state.dtype)], dim=-1)
 
     def state_of(self, features: th.Tensor, actions: th.Tensor, mask: th.Tensor) -> th.Tensor:
         """
-        What acting would have left.
+        The state that acting would have reached.
 
-        :param features: of the last K observations, the oldest first, shape (K, B, F)
-        :param actions: in [-1, 1], shape (K, B, A), or numbers of actions, shape (K, B, 1)
-        :param mask: 0 for what was before the episode's start, shape (K, B)
-        :return: shape (B, S)
+        :param features: features of the last K observations, the oldest first, shape (K, B, F)
+        :param actions: the last K actions, in [-1, 1], shape (K, B, A), or numbers of discrete actions, shape (K, B, 1)
+        :param mask: 1 for steps of the episode, 0 for those before its start, shape (K, B)
+        :return: state of the memory, shape (B, S)
         """
         pairs = th.cat([features, self._encoded(actions)], dim=-1)
         return th.where(mask[..., None] > 0, pairs, th.zeros_like(pairs)).transpose(0, 1).flatten(1)
 
     def estimate(self, state: th.Tensor) -> th.Tensor:
         """
-        :param state: shape (B, S)
-        :return: shape (B, L)
+        :param state: state of the memory, shape (B, S)
+        :return: estimate of the latent, shape (B, L)
         """
         pairs = self.per_pair(state.reshape(-1, self.length, self.pair_dim))
         return self.output(self.over_time(pairs.transpose(1, 2)).flatten(1))

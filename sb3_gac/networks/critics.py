@@ -1,4 +1,4 @@
-"""Q-networks on the entries of one role: an ensemble evaluated at once, of given actions or of all."""
+"""Q-networks on the entries of one role: an ensemble that is evaluated at once, for given actions or for all actions."""
 
 import itertools
 from typing import Any
@@ -17,19 +17,20 @@ from sb3_gac.networks.role_model import RoleModel
 
 class CriticEnsemble(RoleModel):
     """
-    Q-networks on the entries of one role, evaluated together: of actions that they are given.
+    An ensemble of Q-networks on the entries of one role, which value given actions and are evaluated together.
 
-    :param observation_space: the entries that this role reads
-    :param action_space: Box
+    :param observation_space: space of the entries that this role reads
+    :param action_space: Box of A dimensions
     :param net_arch: hidden layer sizes
     :param features_extractor: encoder of the entries
-    :param features_dim: its output size, F
-    :param activation_fn: between layers
-    :param normalize_images: divide images by 255
-    :param rest_extractor: encoder of the entries that the learner does not read, if ``features_extractor`` is the
-        learner's
+    :param features_dim: number of features that go into the hidden layers, F
+    :param activation_fn: activation after each hidden layer
+    :param normalize_images: whether images are divided by 255
+    :param rest_extractor: encoder of the entries that the deployed policy does not read, if ``features_extractor`` is the
+        deployed policy's; else ``None``
     :param n_critics: size of the ensemble, N
-    :param memory: of the entries, for sequences; ``features_dim`` is then its output size. Actions join after it
+    :param memory: memory between the encoder and the layers that actions go into; ``features_dim`` is then its output size.
+        ``None`` for none
     """
 
     features_extractor: BaseFeaturesExtractor
@@ -63,7 +64,7 @@ class CriticEnsemble(RoleModel):
         self._make_ends(features_dim)
 
     def _make_ends(self, features_dim: int) -> None:
-        """First and last layer."""
+        """Build the first and the last layer."""
         action_dim = get_action_dim(self.action_space)
         self.input: nn.Module | None = None
         if self.net_arch:
@@ -73,26 +74,28 @@ class CriticEnsemble(RoleModel):
     def forward(self, obs: PyTorchObs, actions: th.Tensor | None) -> th.Tensor:
         r"""
         :param obs: observation with at least the entries of this role, (\*E, ...) of each
-        :param actions: in [-1, 1], shape (\*E, A), or (K, \*E, A) for K of each observation
-        :return: shape (N, \*E), or (N, K, \*E)
+        :param actions: actions in [-1, 1], shape (\*E, A), or (K, \*E, A) for K actions to each observation
+        :return: values of the actions by each critic, shape (N, \*E), or (N, K, \*E)
         """
         return self.values(self.encode(obs), actions)
 
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         r"""
-        What is needed of the observations, whatever the actions.
+        The features of observations, which serve for any actions.
 
         :param obs: observation with at least the entries of this role, (\*E, ...) of each
-        :return: shape (\*E, F), or with a memory (N, T, B, F)
+        :return: features, shape (\*E, F), or with a memory (N, T, B, F)
         """
         features = self.extract_features(obs, self.features_extractor)
         return features if self.memory is None else self.memory(features)[0]
 
     def values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
         """
-        :param features: of :meth:`encode`
-        :param actions: see :meth:`forward`
-        :return: see :meth:`forward`
+        The values of actions at encoded observations.
+
+        :param features: features from :meth:`encode`
+        :param actions: actions in the form that :meth:`forward` describes
+        :return: values in the form that :meth:`forward` describes
         """
         members = features if self.memory is not None else features.expand(self.n_critics, *features.shape)
         if members.dim() == 3:
@@ -103,9 +106,9 @@ class CriticEnsemble(RoleModel):
 
     def _values(self, features: th.Tensor, actions: th.Tensor | None) -> th.Tensor:
         """
-        :param features: shape (N, B, F)
-        :param actions: shape (B, A), or (K, B, A)
-        :return: shape (N, B), or (N, K, B)
+        :param features: features for each critic, shape (N, B, F)
+        :param actions: actions in [-1, 1], shape (B, A), or (K, B, A)
+        :return: values by each critic, shape (N, B), or (N, K, B)
         """
         assert actions is not None
         if self.input is None:
@@ -130,9 +133,9 @@ class CriticEnsemble(RoleModel):
 
 class DiscreteCriticEnsemble(CriticEnsemble):
     """
-    Q-networks with a value for every action.
+    An ensemble of Q-networks that value every action at once.
 
-    Arguments are those of :class:`CriticEnsemble`, but for ``action_space``: Discrete, of A actions.
+    Arguments are those of :class:`CriticEnsemble`, except that ``action_space`` is a Discrete space of A actions.
     """
 
     def _make_ends(self, features_dim: int) -> None:
@@ -144,8 +147,8 @@ class DiscreteCriticEnsemble(CriticEnsemble):
     def forward(self, obs: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor:
         r"""
         :param obs: observation with at least the entries of this role, (\*E, ...) of each
-        :param actions: numbers of actions, shape (\*E, 1); ``None`` for all
-        :return: shape (N, \*E), or (N, \*E, A) of all actions
+        :param actions: numbers of actions, shape (\*E, 1); ``None`` for all actions
+        :return: values by each critic, shape (N, \*E), or (N, \*E, A) for all actions
         """
         return super().forward(obs, actions)
 

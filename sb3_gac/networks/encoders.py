@@ -1,4 +1,4 @@
-"""Encoders of observation entries: what SB3's CombinedExtractor does, cheaper for vectors, and for entries of any name."""
+"""Encoders of observation entries, as SB3's CombinedExtractor is one: cheaper for vectors, and for entries of any name."""
 
 from collections.abc import Iterable, Sequence
 
@@ -12,14 +12,14 @@ from torch import nn
 from sb3_gac.checks.entries import encoded_size
 from sb3_gac.networks.layers import Head
 
-SMALLEST_IMAGE = 36  # pixels of each side that SB3's NatureCNN leaves something of
+SMALLEST_IMAGE = 36  # pixels of a side, below which SB3's NatureCNN has no output
 
 
 class VectorExtractor(BaseFeaturesExtractor):
     """
-    What SB3's ``CombinedExtractor`` does to vectors, at a tenth of the cost: joins them, in the space's order.
+    An encoder that joins vectors in the space's order, as SB3's ``CombinedExtractor`` does, at a tenth of the cost.
 
-    :param observation_space: entries that are all one-dimensional Boxes of float32, which no preprocessing changes
+    :param observation_space: Dict of one-dimensional Boxes of float32, which need no preprocessing
     """
 
     def __init__(self, observation_space: spaces.Dict):
@@ -28,28 +28,28 @@ class VectorExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         """
-        :param observations: at least these entries, (B, ...) each
-        :return: shape (B, F)
+        :param observations: dict with at least these entries, (B, ...) of each
+        :return: features, shape (B, F)
         """
         return th.cat([observations[key].float() for key in self._keys], dim=-1)
 
     @staticmethod
     def fits(space: spaces.Dict) -> bool:
-        """Whether all entries are such vectors."""
+        """Whether all entries of a space are one-dimensional Boxes of float32."""
         return all(isinstance(box, spaces.Box) and len(box.shape) == 1 and box.dtype == np.float32 for box in space.values())
 
 
 class EntryExtractor(CombinedExtractor):
     """
-    SB3's ``CombinedExtractor`` for entries of any name and kind; its parameters have the names that they have there.
+    SB3's ``CombinedExtractor`` for entries of any name and kind; its parameters have the same names as SB3's.
 
-    :param observation_space: of the entries
-    :param cnn_output_dim: features of each image
-    :param normalized_image: whether all three-dimensional Boxes are images, of whatever type and bounds
+    :param observation_space: Dict of the entries
+    :param cnn_output_dim: number of features of each image
+    :param normalized_image: whether all three-dimensional Boxes count as images, regardless of type and bounds
     """
 
     def __init__(self, observation_space: spaces.Dict, cnn_output_dim: int = 256, normalized_image: bool = False):
-        BaseFeaturesExtractor.__init__(self, observation_space, features_dim=1)  # not known yet
+        BaseFeaturesExtractor.__init__(self, observation_space, features_dim=1)  # the number of features is set below
         self._names = module_names(observation_space.spaces)
         extractors: dict[str, nn.Module] = {}
         features_dim = 0
@@ -66,20 +66,20 @@ class EntryExtractor(CombinedExtractor):
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         """
-        :param observations: these entries, (B, ...) each
-        :return: shape (B, F)
+        :param observations: dict of these entries, (B, ...) of each
+        :return: features, shape (B, F)
         """
         return th.cat([self.extractors[name](observations[key]) for key, name in self._names.items()], dim=1)
 
 
 class LatentExtractor(BaseFeaturesExtractor):
     """
-    Entries, in a few numbers from -1 to 1: tanh of a network on their features.
+    A latent of the entries, of a few numbers from -1 to 1: tanh of a network on their features.
 
-    :param extractor: of the entries
-    :param net_arch: hidden layer sizes
-    :param latent_dim: L
-    :param activation_fn: between layers
+    :param extractor: encoder of the entries
+    :param net_arch: hidden layer sizes of the network
+    :param latent_dim: size of the latent, L
+    :param activation_fn: activation after each hidden layer
     """
 
     def __init__(
@@ -96,17 +96,17 @@ class LatentExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         """
-        :param observations: these entries, (B, ...) each
-        :return: shape (B, L)
+        :param observations: dict of these entries, (B, ...) of each
+        :return: latent, shape (B, L)
         """
         return th.tanh(self.output(self.net(self.extractor(observations))))
 
 
 class JoinedExtractor(BaseFeaturesExtractor):
     """
-    Features of several extractors side by side.
+    The features of several encoders side by side.
 
-    :param extractors: each of entries of its own, which others may have as well
+    :param extractors: encoders of one or more entries each; several encoders may read the same entry
     """
 
     def __init__(self, extractors: Sequence[BaseFeaturesExtractor]):
@@ -116,8 +116,8 @@ class JoinedExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         """
-        :param observations: all of these entries, (B, ...) each
-        :return: shape (B, F)
+        :param observations: dict with at least the entries of all encoders, (B, ...) of each
+        :return: features, shape (B, F)
         """
         features = [each({key: observations[key] for key in _entries_of(each)}) for each in self.extractors]
         return th.cat(features, dim=-1)
@@ -129,8 +129,11 @@ def _entries_of(extractor: nn.Module) -> dict[str, spaces.Space]:
 
 def module_names(keys: Iterable[str]) -> dict[str, str]:
     """
-    :param keys: names of entries
-    :return: key -> a name that torch's ``ModuleDict`` takes: the key itself, unless it has a dot or is one of its attributes
+    Names for the modules of entries.
+
+    :param keys: names of observation entries
+    :return: name of an entry -> name that torch's ``ModuleDict`` accepts: the entry's own, unless it has a dot or is the name
+        of one of ``ModuleDict``'s attributes
     """
     keys, attributes = list(keys), nn.ModuleDict()
     names: dict[str, str] = {}

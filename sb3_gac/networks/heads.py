@@ -1,7 +1,8 @@
 """
-What a policy network ends with, by action space: a tanh-Gaussian for Box, a categorical distribution for Discrete.
+Output layers of policy networks, by action space: a tanh-Gaussian for Box, a categorical distribution for Discrete.
 
-All that depends on the kind of action is here, in :mod:`sb3_gac.math.distributions`, and in the two critic ensembles.
+This module, :mod:`sb3_gac.math.distributions` and the two critic ensembles are the only places that depend on the kind of
+action.
 """
 
 import math
@@ -23,12 +24,13 @@ LOG_STD_BOUNDS = (-5.0, 1.0)
 
 class GaussianHead(nn.Module):
     """
-    Mean and log standard deviation before tanh.
+    Output layers for the mean and log standard deviation of actions before tanh.
 
-    :param latent_dim: H
-    :param action_space: of A dimensions
+    :param latent_dim: size of the last hidden layer, H
+    :param action_space: Box of A dimensions
     :param log_std_bounds: smallest and largest log standard deviation before tanh
-    :param softplus_min_std: see :func:`make_head`
+    :param softplus_min_std: smallest standard deviation of a head with softplus, see :func:`make_head`; ``None`` for a head
+        with exp
     """
 
     def __init__(
@@ -47,9 +49,9 @@ class GaussianHead(nn.Module):
 
     def forward(self, latent: th.Tensor, detach_std: bool = False) -> TanhGaussian:
         """
-        :param latent: shape (\\*E, H)
-        :param detach_std: whether the standard deviation's gradient stops at its own layer
-        :return: shapes (\\*E, A)
+        :param latent: activations of the last hidden layer, shape (\\*E, H)
+        :param detach_std: whether the standard deviation's gradient stops at its output layer
+        :return: distribution of actions, shapes (\\*E, A)
         """
         output = self.log_std(latent.detach() if detach_std else latent)
         if self.softplus_min_std is None:
@@ -57,7 +59,7 @@ class GaussianHead(nn.Module):
         return TanhGaussian(self.mean(latent), (F.softplus(output) + self.softplus_min_std).log())
 
     def deployment_parameters(self) -> list[nn.Parameter]:
-        """Those that serve at deployment only, if the standard deviation of training is the guider's."""
+        """The parameters that serve at deployment only, if the standard deviation of training is the guider's."""
         return list(self.log_std.parameters())
 
     @staticmethod
@@ -65,17 +67,21 @@ class GaussianHead(nn.Module):
         deployed: TanhGaussian, borrowing: TanhGaussian, mask: th.Tensor | None = None
     ) -> dict[str, th.Tensor]:
         """
-        :param deployed: the learner with its own standard deviation, shapes (\\*E, A)
-        :param borrowing: with the guider's, as a constant, shapes (\\*E, A)
-        :param mask: shape (\\*E)
-        :return: name -> scalar, what :meth:`deployment_parameters` are fitted with
+        The losses that fit :meth:`deployment_parameters`.
+
+        :param deployed: the learner's distribution with its own standard deviation, shapes (\\*E, A)
+        :param borrowing: the learner's distribution with the guider's standard deviation, as a constant, shapes (\\*E, A)
+        :param mask: 1 for valid steps and 0 for padding, shape (\\*E); ``None`` if all are valid
+        :return: name of a loss -> scalar
         """
         return {"log_std_loss": log_std_loss(deployed.log_std, borrowing.log_std, mask)}
 
     @th.no_grad()
     def shrink(self, factor: float) -> None:
         """
-        :param factor: of the mean's weights and biases
+        Make the initial means smaller.
+
+        :param factor: factor that multiplies the weights and biases of the mean's layer
         """
         self.mean.weight.mul_(factor)
         self.mean.bias.mul_(factor)
@@ -83,10 +89,10 @@ class GaussianHead(nn.Module):
 
 class CategoricalHead(nn.Module):
     """
-    Unnormalised log-probabilities.
+    Output layer for the unnormalised log-probabilities of discrete actions.
 
-    :param latent_dim: H
-    :param action_space: of A actions
+    :param latent_dim: size of the last hidden layer, H
+    :param action_space: Discrete space of A actions
     """
 
     def __init__(self, latent_dim: int, action_space: spaces.Discrete):
@@ -95,27 +101,29 @@ class CategoricalHead(nn.Module):
 
     def forward(self, latent: th.Tensor, detach_std: bool = False) -> Categorical:
         """
-        :param latent: shape (\\*E, H)
-        :param detach_std: there is none
-        :return: shape (\\*E, A)
+        :param latent: activations of the last hidden layer, shape (\\*E, H)
+        :param detach_std: without effect, since there is no standard deviation
+        :return: distribution of actions, shape (\\*E, A)
         """
         return Categorical(self.logits(latent))
 
     def deployment_parameters(self) -> list[nn.Parameter]:
-        """None: the learner is itself, with a guider and without."""
+        """No parameters: the learner's distribution is the same in training and at deployment."""
         return []
 
     @staticmethod
     def deployment_losses(
         deployed: Categorical, borrowing: Categorical, mask: th.Tensor | None = None
     ) -> dict[str, th.Tensor]:
-        """None."""
+        """No losses, since no parameters serve at deployment only."""
         return {}
 
     @th.no_grad()
     def shrink(self, factor: float) -> None:
         """
-        :param factor: of weights and biases
+        Make the initial logits smaller.
+
+        :param factor: factor that multiplies the weights and biases of the layer
         """
         self.logits.weight.mul_(factor)
         self.logits.bias.mul_(factor)
@@ -128,12 +136,16 @@ def make_head(
     softplus_min_std: float | None = None,
 ) -> nn.Module:
     """
-    :param latent_dim: H
-    :param action_space: Box or Discrete
-    :param log_std_bounds: for Box
-    :param softplus_min_std: for Box: the standard deviation is softplus(output) and so much more, as Brax has it with 0.001
-        (``NormalTanhDistribution``); ``None`` for exp(output), the output within ``log_std_bounds``
-    :raises ValueError: if one of the two is no such number, or both are given
+    The head that fits an action space.
+
+    :param latent_dim: size of the last hidden layer, H
+    :param action_space: Box or Discrete space of actions
+    :param log_std_bounds: smallest and largest log standard deviation before tanh, for Box
+    :param softplus_min_std: smallest standard deviation, for Box: the standard deviation is ``softplus_min_std`` +
+        softplus(output), as in Brax, where the smallest one is 0.001 (``NormalTanhDistribution``). ``None`` for exp(output),
+        the output within ``log_std_bounds``
+    :return: Gaussian head for Box, categorical head for Discrete
+    :raises ValueError: if ``log_std_bounds`` is no range, ``softplus_min_std`` is no number above 0, or both are given
     """
     if isinstance(action_space, spaces.Discrete):
         return CategoricalHead(latent_dim, action_space)
@@ -151,9 +163,11 @@ def make_head(
 
 def check_action_space(algorithm: str, action_space: spaces.Space) -> None:
     """
-    :param algorithm: for the message
-    :param action_space: of the environment
-    :raises UnsupportedActionSpaceError: if there is no head for it
+    Check whether there is a head for the environment's actions.
+
+    :param algorithm: name of the algorithm, for the message
+    :param action_space: action space of the environment
+    :raises UnsupportedActionSpaceError: if there is no head for the space
     """
     if isinstance(action_space, spaces.Box):
         check_box_actions(action_space)
@@ -173,11 +187,14 @@ def check_action_space(algorithm: str, action_space: spaces.Space) -> None:
 
 def resolve_target_entropy(target_entropy: Any, action_space: spaces.Space) -> float:
     """
-    :param target_entropy: a number; "auto", the paper's: -0.5 per dimension, or 0.9 of a uniform choice's; "sac", SAC's: -1
-        per dimension, or 0.98 of a uniform choice's (arXiv 1910.07207)
-    :param action_space: Box or Discrete
-    :return: entropy in nats
-    :raises ValueError: if it is none of these
+    The target entropy in numbers.
+
+    :param target_entropy: a number; "auto", the paper's: -0.5 for each action dimension, or 0.9 times the entropy of a uniform
+        choice among discrete actions; "sac", SAC's: -1 for each action dimension, or 0.98 times the entropy of a uniform
+        choice (arXiv 1910.07207)
+    :param action_space: Box or Discrete space of actions
+    :return: target entropy, in nats
+    :raises ValueError: if ``target_entropy`` has another form
     """
     if isinstance(action_space, spaces.Discrete):
         named = {name: share * math.log(action_space.n) for name, share in (("auto", 0.9), ("sac", 0.98))}
@@ -197,10 +214,12 @@ def resolve_target_entropy(target_entropy: Any, action_space: spaces.Space) -> f
 
 def resolve_target_divergence(target_divergence: str | float, action_space: spaces.Space) -> float:
     """
-    :param target_divergence: a number; "auto": 0.5 per dimension, as much as a mean does that is off by one standard
-        deviation, or half of a uniform choice's entropy
-    :param action_space: Box or Discrete
-    :return: KL divergence in nats, summed over dimensions
+    The target divergence in numbers.
+
+    :param target_divergence: a number; "auto": 0.5 for each action dimension, which is the KL of a mean that is off by one
+        standard deviation, or half of the entropy of a uniform choice among discrete actions
+    :param action_space: Box or Discrete space of actions
+    :return: KL divergence, in nats, summed over action dimensions
     """
     if target_divergence != "auto":
         return float(target_divergence)

@@ -1,4 +1,4 @@
-"""Layers of networks: last ones in float32, and those of an ensemble in one product."""
+"""Layers of networks: output layers in float32, and the layers of an ensemble in one matrix product."""
 
 import math
 from collections.abc import Callable
@@ -11,9 +11,11 @@ INITIALIZATIONS = ("torch", "lecun_uniform")
 
 def in_float32(layer: Callable[[th.Tensor], th.Tensor], x: th.Tensor) -> th.Tensor:
     """
-    :param layer: one that stays in float32 where the layers before it are in mixed precision
-    :param x: its input
-    :return: its output
+    Apply a layer in float32, also where the layers before it run in mixed precision.
+
+    :param layer: function of the input
+    :param x: input of the layer
+    :return: output of the layer
     """
     if not th.is_autocast_enabled(x.device.type):
         return layer(x)
@@ -22,23 +24,23 @@ def in_float32(layer: Callable[[th.Tensor], th.Tensor], x: th.Tensor) -> th.Tens
 
 
 class Head(nn.Linear):
-    """A last layer, in float32."""
+    """A linear output layer that computes in float32."""
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
-        :param x: shape (B, F)
-        :return: shape (B, H)
+        :param x: input, shape (B, F)
+        :return: output, shape (B, H)
         """
         return in_float32(super().forward, x)
 
 
 class EnsembleLinear(nn.Module):
     """
-    ``n_members`` linear layers in one batched product, each initialised like ``torch.nn.Linear``.
+    The linear layers of an ensemble in one batched matrix product, each initialised like ``torch.nn.Linear``.
 
     :param n_members: size of the ensemble, N
-    :param in_features: F
-    :param out_features: H
+    :param in_features: size of the input, F
+    :param out_features: size of the output, H
     """
 
     def __init__(self, n_members: int, in_features: int, out_features: int):
@@ -49,32 +51,32 @@ class EnsembleLinear(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
-        :param x: shape (N, B, F)
-        :return: shape (N, B, H)
+        :param x: input of each member, shape (N, B, F)
+        :return: output of each member, shape (N, B, H)
         """
         return th.bmm(x, self.weight) + self.bias
 
 
 class EnsembleHead(EnsembleLinear):
-    """Last layers of an ensemble, in float32."""
+    """The linear output layers of an ensemble, computed in float32."""
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
-        :param x: shape (N, B, F)
-        :return: shape (N, B, H)
+        :param x: input of each member, shape (N, B, F)
+        :return: output of each member, shape (N, B, H)
         """
         return in_float32(super().forward, x)
 
 
 class EnsembleInput(nn.Module):
     """
-    First layer of an ensemble, with separate weights for features and actions: where only the actions have a gradient,
-    as in a policy's loss, only theirs is computed.
+    The first layers of an ensemble, with separate weights for features and actions: where only the actions have a gradient, as
+    in a policy's loss, no gradient of the features is computed.
 
     :param n_members: size of the ensemble, N
-    :param features_dim: F
-    :param action_dim: A
-    :param out_features: H
+    :param features_dim: number of features, F
+    :param action_dim: number of action dimensions, A
+    :param out_features: size of the output, H
     """
 
     def __init__(self, n_members: int, features_dim: int, action_dim: int, out_features: int):
@@ -86,9 +88,10 @@ class EnsembleInput(nn.Module):
 
     def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        :param features: shape (N, B, F)
-        :param actions: shape (B, A), or (K, B, A) for K actions to each row of features, whose product is computed once
-        :return: shape (N, B, H), or (N, K B, H)
+        :param features: features for each member, shape (N, B, F)
+        :param actions: actions, shape (B, A), or (K, B, A) for K actions to each row of features; the features' product is
+            then computed once for all K
+        :return: output of each member, shape (N, B, H), or (N, K B, H)
         """
         x = th.bmm(features, self.features_weight)
         if actions.dim() == 2:
@@ -100,10 +103,11 @@ class EnsembleInput(nn.Module):
 
 class EnsembleOutput(nn.Module):
     """
-    Last layer of an ensemble, one value each: a product and a sum, several times faster than so thin a matrix product.
+    The output layers of an ensemble, of one value for each member, as a product and a sum: several times faster than a matrix
+    product with one column.
 
     :param n_members: size of the ensemble, N
-    :param in_features: H
+    :param in_features: size of the input, H
     """
 
     def __init__(self, n_members: int, in_features: int):
@@ -114,8 +118,8 @@ class EnsembleOutput(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
-        :param x: shape (N, B, H)
-        :return: shape (N, B)
+        :param x: input of each member, shape (N, B, H)
+        :return: value of each member, shape (N, B)
         """
         return (x * self.weight).sum(dim=-1) + self.bias
 
@@ -123,11 +127,13 @@ class EnsembleOutput(nn.Module):
 @th.no_grad()
 def lecun_uniform_(module: nn.Module) -> None:
     """
-    Weights from U(-sqrt(3 / F), sqrt(3 / F)) of F inputs, whose variance is 1 / F, and biases of zero: the initialisation of
-    LeCun et al. (1998, Efficient BackProp), which Brax's networks have. It is torch's, drawn before, times sqrt(3), so that a
-    last layer that was made small stays so. What a network remembers with has torch's own.
+    Turn torch's initialisation into that of LeCun et al. (1998, Efficient BackProp), which Brax's networks have.
 
-    :param module: whose linear layers and convolutions have torch's initialisation
+    Weights of a layer with F inputs are then from U(-sqrt(3 / F), sqrt(3 / F)), with the variance 1 / F, and biases are zero.
+    The weights are those that torch has drawn, times sqrt(3), so that an output layer that was made small stays small.
+    Recurrent layers keep torch's initialisation.
+
+    :param module: network whose linear layers and convolutions have torch's initialisation
     """
     for layer in module.modules():
         if isinstance(layer, (nn.Linear, nn.Conv1d, nn.Conv2d, EnsembleLinear, EnsembleInput, EnsembleOutput)):

@@ -1,4 +1,4 @@
-"""What networks remember: of a sequence by hidden layers and a recurrent cell, before the rest of the network."""
+"""Memories of networks: the base of all memories, and a recurrent layer with hidden layers before it."""
 
 import itertools
 from typing import Any
@@ -11,18 +11,20 @@ from sb3_gac.networks.layers import EnsembleLinear
 
 
 class Memory(nn.Module):
-    """What a network remembers from one step to the next: a row of numbers each, zeros at an episode's start."""
+    """The memory of a network. Its state is a row of numbers for each observation, zeros at an episode's start."""
 
-    #: Numbers in a row, S
+    #: Size of the state, S
     state_size: int
 
     def state_before(self, state: np.ndarray | None, episode_start: np.ndarray | None, batch: int) -> th.Tensor:
         """
-        :param state: as the last :meth:`forward` left it, shape (B, S), or ``None``
-        :param episode_start: true where an episode starts, which is without a memory, shape (B,)
-        :param batch: B
-        :return: shape (1, B, S)
-        :raises ValueError: if ``state`` or ``episode_start`` is of another number of observations
+        The state before a step of acting, which is zero where an episode starts.
+
+        :param state: state after the last step, shape (B, S); ``None`` if all episodes start
+        :param episode_start: true where an episode starts, shape (B,); ``None`` if no episode starts
+        :param batch: number of observations, B
+        :return: state of the memory, shape (1, B, S)
+        :raises ValueError: if ``state`` or ``episode_start`` has another number of rows than B
         """
         for name, given in (("state", state), ("episode_start", episode_start)):
             if given is not None and len(given) != batch:
@@ -41,23 +43,25 @@ class Memory(nn.Module):
 
     def with_action(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        :param state: as a step of acting left it, shape (B, S)
-        :param actions: that were then taken, in [-1, 1], shape (B, \\*action shape), or numbers of actions
-        :return: what is remembered of both; by a memory of observations alone, the same
+        Add the actions of a step to the state; a memory of observations alone leaves the state as it is.
+
+        :param state: state after a step of acting, shape (B, S)
+        :param actions: actions taken in that step, in [-1, 1], shape (B, \\*action shape), or numbers of discrete actions
+        :return: state for the next step, shape (B, S)
         """
         return state
 
 
 class RecurrentCore(Memory):
     """
-    Hidden layers and then one recurrent layer, for each member of an ensemble; the layers are batched over members, each
-    recurrent layer takes one pass over time.
+    Hidden layers and then one recurrent layer, for each member of an ensemble. The hidden layers are batched over members;
+    each recurrent layer takes one pass over time.
 
-    :param cell: "gru" or "lstm"
-    :param features_dim: size of what comes in, F
+    :param cell: kind of recurrent layer, "gru" or "lstm"
+    :param features_dim: number of input features, F
     :param net_arch: hidden layer sizes before the recurrent layer
-    :param hidden_size: of the recurrent layer, H
-    :param activation_fn: after each hidden layer
+    :param hidden_size: size of the recurrent layer, H
+    :param activation_fn: activation after each hidden layer
     :param n_members: size of the ensemble, N
     """
 
@@ -83,9 +87,9 @@ class RecurrentCore(Memory):
 
     def forward(self, features: th.Tensor, state: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
         """
-        :param features: shape (T, B, F)
-        :param state: before the first step, shape (N, B, S); ``None`` at an episode's start
-        :return: outputs, shape (N, T, B, H), and the state after the last step
+        :param features: features of T steps of B sequences, shape (T, B, F)
+        :param state: state before the first step, shape (N, B, S); ``None`` at an episode's start
+        :return: outputs of the recurrent layers, shape (N, T, B, H), and state after the last step, shape (N, B, S)
         """
         steps, batch = features.shape[:2]
         x = self.hidden(features.reshape(1, steps * batch, -1).expand(self.n_members, -1, -1))
@@ -99,9 +103,10 @@ class RecurrentCore(Memory):
     @staticmethod
     def _unroll(cell: Any, x: th.Tensor, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        :param x: shape (T, B, F)
-        :param state: shape (B, S); an LSTM's hidden and cell state side by side
-        :return: shapes (T, B, H) and (B, S)
+        :param cell: GRU or LSTM of one member
+        :param x: output of the hidden layers, shape (T, B, F)
+        :param state: state before the first step, shape (B, S); an LSTM's hidden and cell state side by side
+        :return: outputs, shape (T, B, H), and state after the last step, shape (B, S)
         """
         if isinstance(cell, nn.GRU):
             outputs, last = cell(x, state[None])

@@ -13,13 +13,13 @@ from sb3_gac.networks.recurrent import Memory
 
 class RoleModel(BaseModel):
     """
-    A network that reads only the observation entries of its role, whatever else the observation holds.
+    A network that reads the observation entries of its role, and ignores all others.
 
-    With a ``memory`` (:class:`sb3_gac.networks.recurrent.Memory`) it needs sequences from an episode's start on,
-    (T, B, ...) of each entry instead of (B, ...); without one it takes either.
+    A network with a ``memory`` (:class:`sb3_gac.networks.recurrent.Memory`) needs sequences from an episode's start on,
+    (T, B, ...) of each entry. A network without a memory takes sequences or (B, ...) of each entry.
 
-    Where the learner's encoder is shared, ``features_extractor`` is the learner's, which the learner's loss alone
-    trains, and ``rest_extractor`` encodes the entries that the learner does not read.
+    Where the deployed policy's encoder is shared, ``features_extractor`` is the deployed policy's, which only that policy's
+    loss trains, and ``rest_extractor`` encodes the entries that the deployed policy does not read.
     """
 
     rest_extractor: BaseFeaturesExtractor | None
@@ -27,9 +27,11 @@ class RoleModel(BaseModel):
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         """
-        :param obs: observation with at least the entries of this role
-        :param features_extractor: the role's extractor, or the learner's
-        :return: shape (B, F)
+        The features of an observation.
+
+        :param obs: observation with at least the entries of this role, (B, ...) or (T, B, ...) of each
+        :param features_extractor: encoder of this role, or the deployed policy's if it is shared
+        :return: features, shape (B, F) or (T, B, F)
         """
         if self.rest_extractor is None:
             return self._encode(obs, self.observation_space, features_extractor)
@@ -47,5 +49,5 @@ class RoleModel(BaseModel):
         if len(leading) > 1:  # encoders know one leading dimension, sequences have two
             entries = {key: value.flatten(0, 1) for key, value in entries.items()}
         features = extractor({key: encode(value, space[key], self.normalize_images) for key, value in entries.items()})
-        # not unflatten, which ONNX would do for the example's batch alone
+        # Reshaped, not unflattened: ONNX would fix unflatten to the batch size of the example
         return features.reshape(*leading, -1) if len(leading) > 1 else features

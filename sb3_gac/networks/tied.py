@@ -1,4 +1,4 @@
-"""Networks that have layers in common: what they hold together is written down once."""
+"""Networks that have layers in common: a state dict holds each shared tensor once."""
 
 from typing import Any
 
@@ -7,18 +7,18 @@ from torch import nn
 
 def write_each_tensor_once(module: nn.Module) -> None:
     """
-    Leave out of ``state_dict()`` what is there already under an earlier name, as an encoder that several networks share.
+    Leave repeated tensors out of a module's ``state_dict()``, such as those of an encoder that several networks share.
 
-    ``load_state_dict()`` takes it with and without these repetitions.
+    Each tensor keeps its first name. ``load_state_dict()`` accepts a state with or without the repetitions.
 
-    :param module: with all of its networks
+    :param module: module that holds all of the networks
     """
     module.register_state_dict_post_hook(_leave_repetitions_out)
     module.register_load_state_dict_pre_hook(_fill_repetitions_in)
 
 
 def _repetitions(module: nn.Module) -> dict[str, str]:
-    """Name of a parameter or buffer -> the first name of the same one."""
+    """Name of a repeated parameter or buffer -> the first name of the same tensor."""
     named = [*module.named_parameters(remove_duplicate=False), *module.named_buffers(remove_duplicate=False)]
     first: dict[int, str] = {}
     for name, tensor in named:

@@ -1,4 +1,4 @@
-"""Networks that value states, on the entries of one role."""
+"""State-value networks on the entries of one role."""
 
 from typing import Any
 
@@ -13,17 +13,17 @@ from sb3_gac.networks.role_model import RoleModel
 
 class StateValue(RoleModel):
     """
-    V(s), on the entries of one role.
+    The state value V(s), a network on the entries of one role.
 
-    :param observation_space: the entries that this role reads
-    :param action_space: of the environment
+    :param observation_space: space of the entries that this role reads
+    :param action_space: action space of the environment
     :param net_arch: hidden layer sizes
     :param features_extractor: encoder of the entries
-    :param features_dim: its output size
-    :param activation_fn: between layers
-    :param normalize_images: divide images by 255
+    :param features_dim: number of features that go into the hidden layers
+    :param activation_fn: activation after each hidden layer
+    :param normalize_images: whether images are divided by 255
     :param rest_extractor: encoder of the entries that the deployed policy does not read, if ``features_extractor`` is the
-        deployed policy's
+        deployed policy's; else ``None``
     """
 
     features_extractor: BaseFeaturesExtractor
@@ -52,7 +52,7 @@ class StateValue(RoleModel):
     def forward(self, obs: PyTorchObs) -> th.Tensor:
         r"""
         :param obs: observation with at least the entries of this role, (\*E, ...) of each
-        :return: shape (\*E)
+        :return: value of each state, shape (\*E)
         """
         return self.value_net(self.extract_features(obs, self.features_extractor)).squeeze(-1)
 

@@ -1,1 +1,1 @@
-"""How networks and coefficients are moved: optimisers' steps, coefficients, targets, compilation, threads."""
+"""How training changes networks and coefficients: optimiser steps, coefficients, target networks, compilation, threads."""

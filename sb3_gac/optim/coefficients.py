@@ -1,7 +1,8 @@
 """
 Coefficients of a Lagrangian: fixed, learned as dual variables, or moved by steps.
 
-All have a ``value`` to multiply with, ``update(violation)`` to learn from, and say what of them a file has to keep.
+Each coefficient has a ``value``, which multiplies a term of a loss, a method ``update(violation)``, which learns it, and
+``state_names``, which name the state that a file has to keep.
 """
 
 import math
@@ -18,13 +19,13 @@ from sb3_gac.optim.trained import TrainedParameters
 
 class FixedCoefficient:
     """
-    A coefficient that stays what it is.
+    A coefficient that never changes.
 
-    :param value: the coefficient, not negative
-    :param device: where its tensor lives
+    :param value: value of the coefficient, not negative
+    :param device: device of its tensor
     """
 
-    #: Names of what a file has to keep: of optimisers, and of tensors
+    #: Names of the attributes that a file has to keep: of optimisers, and of tensors
     state_names: tuple[list[str], list[str]] = ([], ["value"])
     optimizer: th.optim.Optimizer | None = None
 
@@ -32,28 +33,28 @@ class FixedCoefficient:
         self.value = th.tensor(float(value), device=device)
 
     def refresh(self, compiled: bool | None = None) -> None:
-        """To be called before training: a file's state may have been loaded."""
+        """Do nothing: a fixed coefficient has no optimiser whose state may have been loaded."""
 
     def update(self, violation: th.Tensor, mask: th.Tensor | None = None) -> dict[str, th.Tensor]:
-        """Nothing to learn, and no loss."""
+        """Learn nothing, and return no loss."""
         return {}
 
     def go_on_from(self, other: "Coefficient") -> None:
-        """It is what it was told to be."""
+        """Keep the own value: a fixed coefficient takes over nothing."""
 
     def at_bound(self) -> th.Tensor:
-        """It has none: zero."""
+        """Zero, scalar: a fixed coefficient has no bounds."""
         return th.zeros_like(self.value)
 
 
 class AdditiveCoefficient(FixedCoefficient):
     """
-    A coefficient that is moved by steps of one size, up or down, and not by gradients.
+    A coefficient that rises or falls by steps of one size, without gradients.
 
-    :param value: at the start
+    :param value: value at the start
     :param step: size of a step
     :param bounds: smallest and largest value
-    :param device: where its tensor lives
+    :param device: device of its tensor
     """
 
     def __init__(self, value: float, step: float, bounds: tuple[float, float], device: th.device):
@@ -63,6 +64,8 @@ class AdditiveCoefficient(FixedCoefficient):
 
     def move(self, direction: float) -> None:
         """
+        Move the coefficient, inside its bounds.
+
         :param direction: number of steps, negative for down
         """
         self.value.add_(self.step * direction).clamp_(*self.bounds)
@@ -75,12 +78,12 @@ class AdditiveCoefficient(FixedCoefficient):
 
 class MultiplicativeCoefficient(FixedCoefficient):
     """
-    A coefficient that is moved by a factor, up or down, and that starts at nought.
+    A coefficient that starts at 0, and rises or falls by a factor, without gradients.
 
-    :param first: what nought becomes when it is first moved up
-    :param factor: of a move
-    :param largest: value
-    :param device: where its tensor lives
+    :param first: value after the first move up from 0
+    :param factor: factor by which a move up multiplies, and a move down divides
+    :param largest: largest value
+    :param device: device of its tensor
     """
 
     def __init__(self, first: float, factor: float, largest: float, device: th.device):
@@ -91,7 +94,9 @@ class MultiplicativeCoefficient(FixedCoefficient):
 
     def move(self, up: th.Tensor) -> None:
         """
-        :param up: whether to, a boolean scalar; otherwise it goes down
+        Move the coefficient by the factor, up to its largest value.
+
+        :param up: whether the coefficient rises, boolean scalar; it falls otherwise
         """
         moved = th.where(up, self.value * self.factor, self.value / self.factor)
         risen = th.where(up & (self.value == 0), th.full_like(self.value, self.first), moved)
@@ -104,14 +109,15 @@ class MultiplicativeCoefficient(FixedCoefficient):
 
 class LearnedCoefficient(ABC):
     """
-    Positive coefficients f(x), x learned by gradient steps on a dual loss: they rise while constraints are violated.
+    Positive coefficients f(x), where gradient steps on a dual loss learn x. A coefficient rises while its constraint is
+    violated.
 
-    :param name: what its loss is named after
+    :param name: name of the coefficient, from which its loss is named
     :param initial: start value, inside the bounds
     :param bounds: smallest and largest value
-    :param learning_rate: Adam's, on x
-    :param device: where its tensor lives
-    :param shape: () for one coefficient, (A,) for one of each action dimension
+    :param learning_rate: Adam's step size for x
+    :param device: device of the tensors
+    :param shape: () for one coefficient, (A,) for one coefficient for each action dimension
     """
 
     state_names: tuple[list[str], list[str]] = (["optimizer"], ["parameter"])
@@ -138,36 +144,36 @@ class LearnedCoefficient(ABC):
     @abstractmethod
     def _inverse(value: float) -> float:
         """
-        :param value: of a coefficient
-        :return: x
+        :param value: value of a coefficient
+        :return: x with f(x) equal to the value
         """
 
     @staticmethod
     @abstractmethod
     def _value_and_slope(parameter: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        :param parameter: x
-        :return: coefficient, and its derivative by x
+        :param parameter: x, shape (1,) or (A,)
+        :return: the coefficients f(x) and their derivatives with respect to x, of the same shape
         """
 
     @property
     def value(self) -> th.Tensor:
-        """The coefficients, detached, of the shape that was asked for."""
+        """The coefficients, detached, of the shape that the constructor was given."""
         return self._value_and_slope(self.parameter.detach())[0].view(self.shape)
 
     def refresh(self, compiled: bool | None = None) -> None:
         """
-        To be called before training: a file's state may have been loaded, or the learning rate set.
+        Bring the optimiser up to date, before training, after a file's state was loaded or the learning rate was set.
 
-        :param compiled: see :meth:`TrainedParameters.refresh`
+        :param compiled: whether the next steps are compiled, see :meth:`TrainedParameters.refresh`
         """
         self._trained.refresh(compiled)
 
     def go_on_from(self, other: "Coefficient") -> None:
         """
-        Take over another one's value, inside the own bounds, and what its optimiser has gathered, at the own learning rate.
+        Take over the value and the optimiser state of another coefficient, but keep the own bounds and learning rate.
 
-        :param other: learned as well
+        :param other: learned coefficient of the same kind
         """
         assert isinstance(other, LearnedCoefficient)
         assert self.optimizer is not None
@@ -180,19 +186,20 @@ class LearnedCoefficient(ABC):
         self.refresh()
 
     def at_bound(self) -> th.Tensor:
-        """1 if the coefficient sits on one of its bounds, else 0; the mean over dimensions, scalar."""
+        """1 if the coefficient sits on one of its bounds, else 0; for several coefficients the mean over them, scalar."""
         low, high = self._parameter_bounds
         parameter = self.parameter.detach()
         return ((parameter <= low) | (parameter >= high)).float().mean()
 
     def update(self, violation: th.Tensor, mask: th.Tensor | None = None) -> dict[str, th.Tensor]:
         r"""
-        One gradient step on :func:`sb3_gac.math.losses.dual_loss`: up while the mean violation is positive, down while it is
-        negative.
+        One gradient step on :func:`sb3_gac.math.losses.dual_loss`: a coefficient rises while the mean violation of its
+        constraint is positive, and falls while the mean is negative.
 
-        :param violation: of the constraint per sample, shape (\*E), or (\*E, A) for one coefficient a dimension; or its mean
-        :param mask: shape (\*E), 1 for valid samples; ``None`` if all are
-        :return: loss to log, detached, scalar
+        :param violation: violation of the constraint in each sample, shape (\*E), or (\*E, A) with one coefficient for each
+            action dimension; or the mean violation, scalar
+        :param mask: 1 for valid samples and 0 for padding, shape (\*E); ``None`` if all are valid
+        :return: name of the loss -> loss to log, detached, scalar
         """
         with th.no_grad():
             mean = self._mean(violation, mask)
@@ -202,7 +209,7 @@ class LearnedCoefficient(ABC):
         return {f"{self.name}_loss": dual_loss(value, mean)}
 
     def _mean(self, violation: th.Tensor, mask: th.Tensor | None) -> th.Tensor:
-        """Of each coefficient, over the samples that count."""
+        """Mean violation for each coefficient, over the valid samples."""
         samples = violation.reshape(-1, *self.shape)
         if mask is None:
             return samples.mean(dim=0)
@@ -211,7 +218,7 @@ class LearnedCoefficient(ABC):
 
 
 class SoftplusDual(LearnedCoefficient):
-    """Dual variables softplus(x): steps are of one size where they are large."""
+    """Dual variables softplus(x): where they are large, their steps do not depend on their size."""
 
     @staticmethod
     def _inverse(value: float) -> float:
@@ -223,13 +230,13 @@ class SoftplusDual(LearnedCoefficient):
 
 
 class DualVariable(LearnedCoefficient):
-    """A dual variable exp(x), as SAC's temperature: steps are relative to its size."""
+    """Dual variables exp(x), as SAC's temperature is one: their steps are in proportion to their size."""
 
     state_names = (["optimizer"], ["log_value"])
 
     @property
     def log_value(self) -> th.Tensor:
-        """Its logarithm, shape (1,) of a single one."""
+        """Logarithm of the coefficients, shape (A,), or (1,) for a single coefficient."""
         return self.parameter
 
     @staticmethod
@@ -256,17 +263,19 @@ def make_coefficient(
     shape: tuple[int, ...] = (),
 ) -> Coefficient:
     """
-    Build a coefficient from what the user wrote.
+    Build a coefficient from a constructor argument.
 
-    :param name: constructor argument, for error messages
-    :param spec: "auto", "auto_<start value>" or a number
+    :param name: name of the constructor argument, for error messages and the name of the loss
+    :param spec: value of the argument: "auto", "auto_<start value>" or a number
     :param auto_value: start value for "auto"
     :param bounds: smallest and largest value of a learned coefficient
-    :param learning_rate: of a learned coefficient
-    :param device: where its tensor lives
-    :param kind: of a learned coefficient: exp(x) or softplus(x)
-    :param shape: of a learned coefficient: () for one, (A,) for one of each action dimension
-    :raises ValueError: if ``spec`` or ``bounds`` is none of what is allowed
+    :param learning_rate: Adam's step size for a learned coefficient
+    :param device: device of the coefficient's tensors
+    :param kind: class of a learned coefficient: exp(x) or softplus(x)
+    :param shape: shape of a learned coefficient: () for one, (A,) for one for each action dimension
+    :return: fixed coefficient if ``spec`` is a number, else a learned coefficient
+    :raises ValueError: if ``spec`` has another form or a start value outside the bounds, or if ``bounds`` are not two numbers
+        above 0 in ascending order
     """
     remedy = f'{name} must be "auto", "auto_<start value>" such as "auto_0.5", or a number >= 0, got {spec!r}.'
     low, high = check_range(f"{name}_bounds", bounds, above=0.0)

@@ -1,8 +1,9 @@
 """
 Opt-in compilation: a whole update, or each of its branches, becomes one graph of tensor operations.
 
-``torch.compile`` traces losses, their gradients, clipping and Adam's steps together: everything between two matrix products
-becomes one pass over memory, and Python leaves the step.  On the CPU the code runs without Python's lock.
+``torch.compile`` traces losses, their gradients, clipping and Adam's steps together: all operations between two matrix
+products become one pass over memory, and no Python code runs within a step.  On the CPU the compiled code releases Python's
+lock.
 """
 
 import os
@@ -18,7 +19,7 @@ from typing import Any
 
 import torch as th
 
-#: As many gradient steps, compiled, save more than the half minute that compiling takes
+#: Number of gradient steps from which compilation saves more than the half minute that it takes
 PAYS_FROM = 10_000
 _OPTIONS = {"cpu": {"cpp_wrapper": True}}
 _compiling = Lock()  # one thread at a time
@@ -26,10 +27,10 @@ _compiling = Lock()  # one thread at a time
 
 class CannotCompileError(ValueError):
     """
-    ``compile=True`` where it can't be.
+    Compilation was asked for, but is impossible here.
 
-    :param why: what compilation can't do, or needs, a sentence without its subject
-    :param remedy: what to do about it
+    :param why: reason, as a sentence whose subject "compile=True" is left out
+    :param remedy: advice to the user, an imperative
     """
 
     def __init__(self, why: str, remedy: str):
@@ -39,7 +40,9 @@ class CannotCompileError(ValueError):
 
 def check_can_compile() -> None:
     """
-    :raises CannotCompileError: if this version of torch can't
+    Check whether this version of torch can compile gradient steps.
+
+    :raises CannotCompileError: if the version is too old
     """
     import torch._dynamo.config  # slow to import
 
@@ -49,10 +52,11 @@ def check_can_compile() -> None:
 
 def missing_compiler(device: th.device) -> str | None:
     """
-    What ``torch.compile`` would look for on a device and not find; nothing is run, and torch's compiler is not imported.
+    The first thing that ``torch.compile`` needs for a device and would not find. The check runs no program and does not
+    import torch's compiler.
 
-    :param device: that programs are to run on
-    :return: what is missing, or ``None`` if all is there
+    :param device: device that the programs are to run on
+    :return: name of the missing compiler or file, ``None`` if nothing is missing
     """
     if device.type == "cuda":
         if find_spec("triton") is None:
@@ -71,7 +75,7 @@ def missing_compiler(device: th.device) -> str | None:
 
 
 def is_compiling() -> bool:
-    """Whether a program is being compiled, in any thread: processes of a C++ compiler may be at work."""
+    """Whether a program is being compiled in any thread, so that processes of a C++ compiler may be at work."""
     return _compiling.locked()
 
 
@@ -79,13 +83,14 @@ class Program:
     """
     A function of tensors, compiled at its first call.
 
-    No guards are checked at later calls: whoever calls it keeps one program for each combination of all that it depends on,
-    shapes included. Tensors that the function finds by attributes (parameters, coefficients) are looked up at each call;
-    numbers that it finds so are part of the program.
+    Later calls check no guards: the caller keeps one program for each combination of the things that the function depends on,
+    shapes included. Tensors that the function reads from attributes (parameters, coefficients) are looked up at each call;
+    numbers that the function reads from attributes are constants of the program.
 
-    :param function: of tensors in tuples, named tuples, lists or dicts, with values that are such
-    :param device: that it runs on
-    :param when_it_fails: is told why if compiling fails, and the function runs as it is, then and later; ``None`` for an error
+    :param function: function whose arguments and value are tensors, or tuples, named tuples, lists or dicts of tensors
+    :param device: device that the function runs on
+    :param when_it_fails: callback that gets the error if compiling fails; the function then runs uncompiled, in this call and
+        in later ones. ``None`` raises the error
     """
 
     def __init__(
@@ -97,15 +102,15 @@ class Program:
         self._function, self._when_it_fails = function, when_it_fails
         options: dict[str, Any] = {
             **_OPTIONS.get(device.type, {}),
-            "fallback_random": True,  # the random numbers of the plain function
+            "fallback_random": True,  # draws the same random numbers as the plain function
             "guard_filter_fn": th.compiler.skip_all_guards_unsafe,
         }
-        with _compiling:  # which it begins to import
+        with _compiling:  # th.compile begins to import the compiler
             self._run = th.compile(_with_own_code(function), fullgraph=True, dynamic=False, options=options)
         self._is_ready = False
 
     def __call__(self, *args: Any) -> Any:
-        """The function's value, with parameters as they are now."""
+        """The function's value, with the present values of all tensors that it reads."""
         if self._is_ready:
             return self._run(*args)
         with _compiling:
@@ -126,7 +131,7 @@ class Program:
 
 
 def _with_own_code(function: Callable[..., Any]) -> FunctionType:
-    """``torch.compile`` keeps its results by code object: those of two programs must not be mixed up."""
+    """The function with a code object of its own, since ``torch.compile`` keeps its results by code object."""
 
     def run(*args: Any) -> Any:
         return function(*args)

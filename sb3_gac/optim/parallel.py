@@ -1,10 +1,10 @@
 """
-Two branches of a gradient step at once, on the CPU.
+Two branches of a gradient step that run at the same time, on the CPU.
 
-The networks of this package are small: one matrix product of theirs does not fill two cores, but guider and learner, each
-with critics of its own, are independent of each other for most of a step.  A worker thread takes one branch, the calling
-thread the other, each with half of torch's threads.  (Python's lock is free during every product.)  Results are those of
-the two branches one after the other.
+The networks of this package are small, so that one matrix product does not fill two cores. For most of a step, guider and
+learner, each with critics of its own, are independent of each other.  A worker thread takes one branch and the calling
+thread the other, each with half of torch's threads.  (Python's lock is free during every product.)  The results are the same
+as when one branch runs after the other.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,15 +25,17 @@ def _thread() -> ThreadPoolExecutor:
 
 
 class Worker:
-    """A thread beside the calling one, which does what it is handed in order, with as many of torch's threads as that has."""
+    """A second thread that runs its tasks in order, with as many of torch's threads as the calling thread has."""
 
     def __init__(self) -> None:
         self._handed: list[Future] = []
 
     def submit(self, task: Callable[[], Any]) -> None:
         """
-        :param task: shares nothing that either thread changes before :meth:`wait`; random numbers must be drawn before. It is
-            left out if one before it has failed
+        Hand a task to the second thread, which skips it if an earlier task has failed.
+
+        :param task: function without arguments that, until :meth:`wait`, reads nothing that the calling thread changes,
+            changes nothing that the calling thread reads, and draws no random numbers
         """
         before, threads = tuple(self._handed), th.get_num_threads()
 
@@ -46,7 +48,7 @@ class Worker:
         self._handed.append(_thread().submit(run))
 
     def wait(self) -> None:
-        """Until all is done. An error of the first task that failed is raised."""
+        """Wait until all tasks are done, and raise the error of the first task that failed."""
         handed, self._handed = self._handed, []
         errors = [future.exception() for future in handed]
         for error in errors:
@@ -57,9 +59,9 @@ class Worker:
 @contextmanager
 def worker(enabled: bool) -> Iterator[Worker | None]:
     """
-    A second thread that has half of torch's threads, for as long as the context lasts.
+    A second thread for as long as the context lasts; each of the two threads has half of torch's threads.
 
-    :param enabled: whether to; otherwise there is none
+    :param enabled: whether there is a second thread; if not, the context's value is ``None``
     """
     if not enabled:
         yield None
@@ -70,10 +72,10 @@ def worker(enabled: bool) -> Iterator[Worker | None]:
         yield beside
         beside.wait()
     finally:
-        _thread().submit(int).result()  # after an error in this thread: the other one must not go on alone
+        _thread().submit(int).result()  # after an error here, the second thread must not go on alone
         th.set_num_threads(threads)
 
 
 def has_side_effects(module: nn.Module) -> bool:
-    """Whether a forward pass draws random numbers or changes statistics: then branches must keep their order."""
+    """Whether a forward pass draws random numbers or changes statistics, so that branches must keep their order."""
     return any(isinstance(part, (_DropoutNd, _BatchNorm)) for part in module.modules())

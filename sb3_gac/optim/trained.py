@@ -1,8 +1,8 @@
 """
-The parameters of a network that are trained, and one step of its optimiser.
+The trained parameters of a network, and one step of its optimiser.
 
-What Adam keeps of each parameter is looked up once a round of gradient steps instead of once a step: at 256 units and less
-that bookkeeping takes as long as the arithmetic.
+Adam's state of each parameter is looked up once in a round of gradient steps instead of once in a step: with layers of 256
+units or fewer, looking it up takes as long as the arithmetic.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ T = TypeVar("T")
 
 class AdamTensors(NamedTuple):
     """
-    What one step of Adam reads and changes, in place.
+    The tensors that one step of Adam reads and changes in place.
 
-    :param parameters: of one network
-    :param exp_avgs: running mean of each one's gradient
-    :param exp_avg_sqs: running mean of its square
-    :param steps: taken so far, of each one, scalars
-    :param learning_rate: scalar
-    :param powers: beta1 and beta2 to the number of steps, of each parameter, scalars: for compiled steps, which would
-        compute a power for each number of a parameter
+    :param parameters: parameters of one network
+    :param exp_avgs: running mean of each parameter's gradient, of the parameter's shape
+    :param exp_avg_sqs: running mean of each gradient's square, of the parameter's shape
+    :param steps: number of steps taken so far, a scalar for each parameter
+    :param learning_rate: learning rate, scalar
+    :param powers: beta1 and beta2 to the power of the number of steps, a scalar of each for every parameter; for compiled
+        steps, which would otherwise compute the powers for each element of a parameter
     """
 
     parameters: list[th.Tensor]
@@ -36,7 +36,9 @@ class AdamTensors(NamedTuple):
 
     def bring_up_powers(self, betas: tuple[float, float]) -> None:
         """
-        :param betas: of the optimiser
+        Compute :attr:`powers` from the number of steps.
+
+        :param betas: the optimiser's beta1 and beta2
         """
         for beta, powers in zip(betas, self.powers, strict=True):
             for power, step in zip(powers, self.steps, strict=True):
@@ -45,14 +47,15 @@ class AdamTensors(NamedTuple):
 
 class TrainedParameters:
     """
-    Those parameters of a network that are trainable, of which any may be frozen and unfrozen at any time.
+    The trainable parameters of a network. Any of them may be frozen and unfrozen at any time.
 
-    No gradient, momentum or weight decay moves a frozen one; what the optimiser knew of it is forgotten.
+    No gradient, momentum or weight decay moves a frozen parameter, and the optimiser forgets its state of that parameter.
 
-    :param parameters: of one network
-    :param optimizer: of all of them, in one group; torch's Adam and AdamW take the fast way, if their options allow it
-    :param unclipped: how many of the last parameters have no say in the gradient's norm and its bound
-    :param memory: those of the parameters whose learning rate :meth:`scale_memory` multiplies
+    :param parameters: all parameters of one network
+    :param optimizer: optimiser of these parameters, in one group; a step of torch's Adam or AdamW is faster, if their options
+        allow it
+    :param unclipped: number of parameters, from the last one backwards, that gradient clipping leaves out
+    :param memory: parameters, among these, whose learning rate :meth:`scale_memory` multiplies
     """
 
     def __init__(
@@ -78,9 +81,10 @@ class TrainedParameters:
 
     def refresh(self, compiled: bool | None = None) -> None:
         """
-        To be called before training and before saving: parameters may have been frozen, and a file's state loaded.
+        Look up which parameters are trained, and the optimiser's state. A call is due before training and before saving, since
+        parameters may have been frozen, and a file's state may have been loaded.
 
-        :param compiled: whether the steps to come are; ``None`` if none follow
+        :param compiled: whether the next steps are compiled; ``None`` if no steps follow
         """
         trained = [parameter.requires_grad for parameter in self.everything]
         group = self.optimizer.param_groups[0]
@@ -91,7 +95,7 @@ class TrainedParameters:
             for parameter in self.everything:
                 if not parameter.requires_grad:
                     self.optimizer.state.pop(parameter, None)
-                    parameter.grad = None  # or torch's own step would take it
+                    parameter.grad = None  # torch's own step would apply a gradient that is left
             self.adam = list(map(self._gathered, self._parts(self.parameters))) if _is_plain_adam(self.optimizer) else None
         if self.adam is not None:
             for adam, rate in zip(self.adam, self._learning_rates(), strict=True):
@@ -103,8 +107,10 @@ class TrainedParameters:
 
     def scale_memory(self, scale: float) -> None:
         """
-        :param scale: multiple of the learning rate, for the parameters of the memory
-        :raises ValueError: if the optimiser has one learning rate for all
+        Set the learning rate of the memory's parameters.
+
+        :param scale: multiple of the network's learning rate
+        :raises ValueError: if the optimiser can have only one learning rate for all parameters
         """
         if scale != 1 and self._memory and self.adam is None:
             raise ValueError(
@@ -115,14 +121,14 @@ class TrainedParameters:
         self.optimizer.param_groups[0]["memory_lr_scale"] = scale
 
     def _learning_rates(self) -> list[float]:
-        """Of each of :meth:`_parts`."""
+        """The learning rate of each of :meth:`_parts`."""
         group = self.optimizer.param_groups[0]
         return [group["lr"], group["lr"] * group.get("memory_lr_scale", 1.0)][: 2 if self._memory else 1]
 
     def _parts(self, values: Sequence[T]) -> list[list[T]]:
         """
-        :param values: one for each trained parameter
-        :return: those of what is no memory and, if there is one, those of the memory
+        :param values: one value for each trained parameter, in their order
+        :return: the values of parameters outside of the memory and, if there is a memory, the values of its parameters
         """
         if not self._memory:
             return [list(values)]
@@ -152,8 +158,10 @@ class TrainedParameters:
 
     def in_present_layout(self, state: dict[str, Any]) -> dict[str, Any]:
         """
-        :param state: an optimiser's ``state_dict``, of this version or of those that laid all parameters out as one
-        :return: with an entry for each parameter
+        Bring an optimiser's state into the layout of this version.
+
+        :param state: ``state_dict`` of an optimiser, from this version or from one that laid all parameters out in one tensor
+        :return: the same state with an entry for each parameter
         """
         groups = state.get("param_groups", ())
         if len(groups) != 1 or len(groups[0]["params"]) == len(self.everything):
@@ -172,13 +180,13 @@ class TrainedParameters:
 
     def norm(self, gradients: Sequence[th.Tensor]) -> th.Tensor:
         """
-        :param gradients: of each trained parameter
-        :return: norm of those that are clipped, scalar
+        :param gradients: gradient with respect to each trained parameter, in their order
+        :return: norm of the gradients that clipping counts, scalar
         """
         clipped = self._clipped(gradients)
         if not clipped:
             return th.zeros((), device=self.everything[0].device if self.everything else None)
-        # one call of Python's instead of one for each; torch's compiler has no program for it
+        # One call for all norms is faster than one for each, but torch's compiler can't compile _foreach_norm
         norms = list(map(th.linalg.vector_norm, clipped)) if th.compiler.is_compiling() else th._foreach_norm(clipped)
         return th.linalg.vector_norm(th.stack(norms))
 
@@ -189,8 +197,8 @@ class TrainedParameters:
         """
         One step of the optimiser.
 
-        :param gradients: of each trained parameter
-        :param scale: of those that are clipped, scalar; ``None`` leaves them as they are
+        :param gradients: gradient with respect to each trained parameter, in their order
+        :param scale: factor for the gradients that clipping counts, scalar; ``None`` for no clipping
         """
         if not gradients:
             return
@@ -217,11 +225,11 @@ def _is_plain_adam(optimizer: th.optim.Optimizer) -> bool:
 
 def adam_step(adam: AdamTensors, gradients: Sequence[th.Tensor], options: dict) -> None:
     """
-    One step of Adam, or of AdamW where weight decay is decoupled.
+    One step of Adam, or of AdamW if weight decay is decoupled.
 
-    :param adam: is changed in place
-    :param gradients: of each parameter
-    :param options: of the optimiser's group
+    :param adam: parameters and Adam's state of them, changed in place
+    :param gradients: gradient with respect to each of these parameters, in their order
+    :param options: options of the optimiser's parameter group: betas, eps, weight decay, learning rate
     """
     decoupled, weight_decay, eps = options["decoupled_weight_decay"], options["weight_decay"], options["eps"]
     beta1, beta2 = options["betas"]

@@ -1,21 +1,21 @@
 """
 Named sets of arguments: ``GAC("MultiInputPolicy", env, **preset("small"))``.
 
-Each is a YAML file beside this one, and read by everybody: by :func:`preset`, the main job, the zoo and the benchmarks::
+Each preset is a YAML file beside this module. :func:`preset`, the main job, the zoo and the benchmarks read it::
 
-    extends: other                  # preset that this one is over, if any
-    run: {envs: 4}                  # environments side by side that it is meant for; see :class:`Preset` for what else
+    extends: other                  # preset whose settings this one overrides, if any
+    run: {envs: 4}                  # number of environments that the preset is meant for; see :class:`Preset` for other keys
     arguments:
-      all: {gamma: 0.99}            # of every algorithm
-      off_policy: {batch_size: 128} # of those of a family, over those of all
-      gac: {target_kl: 0.01}        # of that one and its subclasses alone, over the above
-    tasks:                          # the same again, over the above: for a task, and for that task at a noise level
+      all: {gamma: 0.99}            # for every algorithm
+      off_policy: {batch_size: 128} # for the algorithms of a family; override those for every algorithm
+      gac: {target_kl: 0.01}        # for one algorithm and its subclasses; override the above
+    tasks:                          # the same for a task, and for the task at a noise level; override the above
       Ant: {arguments: {gac: {target_kl: 0.005}}, noises: {0.3: {gac: {target_kl: 0.001}}}}
-    normalize:                      # of a family or algorithm: arguments of SB3's VecNormalize around its environments
+    normalize:                      # by family or algorithm: arguments of SB3's VecNormalize around the environments
       gac: {norm_reward: false}
 
-An algorithm has its name in :mod:`sb3_gac.algorithms`, or is ``module:Class``.  Activation functions and optimisers are
-torch's, by name.
+An algorithm is named as in :mod:`sb3_gac.algorithms`, or as ``module:Class``.  Activation functions and optimisers have
+torch's names.
 """
 
 from collections.abc import Iterator, Mapping
@@ -31,7 +31,7 @@ from sb3_gac.envs.suites import shows_whole_state, task_named
 from sb3_gac.presets.noises import at_noise, defaults_of, merge
 
 DIRECTORY = Path(__file__).parent
-_BRAX = "brax-"  # the paper's tasks in its own simulator: what is meant for the paper's task is meant for them
+_BRAX = "brax-"  # prefix of the paper's tasks in Brax, which take the arguments of the tasks without it
 _PARTS = ("run", "arguments", "tasks", "normalize")
 _OF_RUN = {"envs", "steps", "eval_episodes", "eval_deterministic"}
 _LIBRARIES = {"activation_fn": nn, "optimizer_class": optim}
@@ -40,14 +40,14 @@ _LIBRARIES = {"activation_fn": nn, "optimizer_class": optim}
 @dataclass(frozen=True)
 class Preset:
     """
-    A file of arguments, as it is.
+    The content of a preset's file.
 
-    :param name: name of the preset's file
-    :param run: environments side by side that ``gradient_steps`` is meant for, ``envs``; and what a benchmark's suite has if
-        it says nothing else: ``steps``, ``eval_episodes`` and ``eval_deterministic``
-    :param arguments: "all" or the name of an algorithm -> arguments
-    :param tasks: task -> ``arguments``, and ``noises``: noise -> arguments
-    :param normalize: "all" or the name of an algorithm -> arguments of ``VecNormalize``
+    :param name: name of the file, without its ending
+    :param run: ``envs``, the number of environments that ``gradient_steps`` is meant for, and defaults of a benchmark's suite:
+        ``steps``, ``eval_episodes`` and ``eval_deterministic``
+    :param arguments: "all", or name of a family or algorithm -> arguments of the algorithm
+    :param tasks: task -> sections "arguments", as above, and "noises", noise -> arguments as above
+    :param normalize: "all", or name of a family or algorithm -> arguments of ``VecNormalize``
     """
 
     name: str
@@ -58,28 +58,35 @@ class Preset:
 
     @property
     def envs(self) -> int:
-        """Environments side by side, for which ``gradient_steps`` is meant."""
+        """Number of environments that ``gradient_steps`` is meant for."""
         number: int = self.run["envs"]
         return number
 
     def normalization(self, algorithm: str | type = "gac") -> dict[str, Any] | None:
         """
-        :param algorithm: its class, or its name in :mod:`sb3_gac.algorithms`
-        :return: arguments of the ``VecNormalize`` around its environments, ``None`` where they show observations as they are
+        The normalisation of an algorithm's environments.
+
+        :param algorithm: class of the algorithm, or its name in :mod:`sb3_gac.algorithms`
+        :return: arguments of the ``VecNormalize`` around the environments; ``None`` for no normalisation
         """
         found = [self.normalize[family] for family in _families(_kind(algorithm)) if family in self.normalize]
         return dict(found[-1]) if found else None
 
     def layers(self, algorithm: type, task: str | None, noise: float) -> Iterator[Mapping[str, Any]]:
         """
-        :param algorithm: class that the arguments are for
-        :param task: of an environment that is registered as ``sb3_gac/<task>-v5``, by its name or that id; ``None`` for any
-            other environment. Brax's ``brax-<task>`` are those of the paper
-        :param noise: standard deviation of the task's sensor noise; between two for which the file has arguments, numbers are
-            interpolated, and beyond the last one it is that one's that count, both with a warning
-        :return: arguments, the later over the earlier: in each part of the file those of all, of ancestors, and its own.
-            ``role_keys`` that leave critics the privileged entry alone are not for tasks where that is not the whole state
-        :raises ValueError: if there is no such task, naming the nearest ones, or the noise is negative
+        The arguments for an algorithm, a task and a noise level, in layers of which later ones override earlier ones.
+
+        Each part of the file has a layer for all algorithms, for the algorithm's ancestors and for itself. Where the
+        privileged entry is not the whole state of the task, a last layer removes ``role_keys``, which would leave the critics
+        that entry alone.
+
+        :param algorithm: class of the algorithm
+        :param task: task of an environment that is registered as ``sb3_gac/<task>-v5``, or its id; ``None`` for any other
+            environment. A task ``brax-<task>`` that the file lacks has the arguments of the task without the prefix
+        :param noise: standard deviation of the task's sensor noise. Between two noise levels of the file, numbers are
+            interpolated; above the last level, the last level's arguments count. Both cause a warning
+        :return: iterator over the layers
+        :raises ValueError: if the task is unknown (the message names similar tasks), or the noise is negative
         """
         families = _families(algorithm)
         if task is not None and task not in self.tasks:
@@ -99,9 +106,11 @@ class Preset:
 
 def read_preset(name: str) -> Preset:
     """
-    :param name: of a preset
-    :return: what its file has
-    :raises ValueError: if there is no such preset, or its file has keys that mean nothing
+    Read the file of a preset.
+
+    :param name: name of the preset
+    :return: content of the file, over the preset that it extends
+    :raises ValueError: if there is no such preset, or its file has unknown or missing keys
     """
     path = DIRECTORY / f"{name}.yml"
     if not path.exists():
@@ -127,14 +136,14 @@ def read_preset(name: str) -> Preset:
 
 
 def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """A part of a preset, the sections in it one over the other where both have one."""
+    """A part of a preset over the same part of another preset; sections that both have are merged."""
     both = below.keys() & above.keys()
     sections = {name: merge(below[name], above[name]) for name in both if isinstance(below[name], Mapping)}
     return {**below, **above, **sections}
 
 
 def _families(algorithm: type) -> list[str]:
-    """What sections for it may be called, the later ones over the earlier ones."""
+    """Names of the sections that hold arguments for an algorithm; later ones override earlier ones."""
     return ["all", *map(name_of, reversed(algorithm.__mro__))]
 
 
@@ -158,7 +167,7 @@ def _check(where: str, content: Any, known: set[str], required: set[str] = froze
 
 
 class _Presets(Mapping[str, Preset]):
-    """All presets by name. A file is read when it is asked for."""
+    """A mapping from names to presets, which reads a file at each access."""
 
     def __getitem__(self, name: str) -> Preset:
         if name not in set(self):
@@ -179,14 +188,18 @@ def preset(
     name: str, *, algorithm: str | type = "gac", task: str | None = None, noise: float = 0.0, **overrides: Any
 ) -> dict[str, Any]:
     """
-    :param name: one of ``PRESETS``, such as "small" or "paper"
-    :param algorithm: that the arguments are for: its class, or its name in :mod:`sb3_gac.algorithms`
-    :param task: as in ``sb3_gac/<task>-v5`` or ``sb3_gac/brax-<task>-v0``, or that id: with what the preset has for it, if
-        anything; ``None`` for an environment that is not registered so
-    :param noise: standard deviation of that task's sensor noise; see :meth:`Preset.layers` for one between the file's
+    The arguments of a preset for an algorithm.
+
+    The arguments are meant for ``PRESETS[name].envs`` environments, in a ``VecNormalize`` with the arguments
+    ``PRESETS[name].normalization(algorithm)`` unless these are ``None``.
+
+    :param name: name of the preset, a key of ``PRESETS`` such as "small" or "paper"
+    :param algorithm: class of the algorithm, or its name in :mod:`sb3_gac.algorithms`
+    :param task: task of an environment that is registered as ``sb3_gac/<task>-v5`` or ``sb3_gac/brax-<task>-v0``, or its id,
+        whose arguments in the preset count as well; ``None`` for any other environment
+    :param noise: standard deviation of the task's sensor noise; see :meth:`Preset.layers` for levels that the preset lacks
     :param overrides: arguments that replace those of the preset; ``policy_kwargs`` are merged
-    :return: keyword arguments of the algorithm, with its ``policy`` where the preset names one; ``PRESETS[name].envs``
-        environments go with them, in a ``VecNormalize`` where ``PRESETS[name].normalization(algorithm)`` is not ``None``
+    :return: keyword arguments of the algorithm, ``policy`` included where the preset has it
     :raises ValueError: if there is no such preset, algorithm or task, or the noise is negative
     """
     found = read_preset(name)
@@ -206,9 +219,11 @@ def _class_of(algorithm: str) -> type:
 
 def instantiate(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """
-    :param arguments: as YAML has them
-    :return: as the class takes them: names of activations and optimisers become classes
-    :raises ValueError: if torch has none of that name
+    Turn the names of torch's activation functions and optimisers into classes.
+
+    :param arguments: arguments of an algorithm, as read from YAML
+    :return: the arguments as the algorithm's class takes them
+    :raises ValueError: if torch has no class of a name
     """
     policy_kwargs = dict(arguments.get("policy_kwargs") or {})
     for key, library in _LIBRARIES.items():

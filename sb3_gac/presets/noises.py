@@ -1,4 +1,4 @@
-"""Arguments of a preset at a noise level, of which its file has only some."""
+"""Arguments of a preset at any noise level, from those at the noise levels of its file."""
 
 import inspect
 import math
@@ -6,21 +6,24 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-_ROUNDING = {"rel_tol": 1e-6, "abs_tol": 1e-9}  # of float32, and of sums such as 0.1 + 0.2
+_ROUNDING = {"rel_tol": 1e-6, "abs_tol": 1e-9}  # rounding of float32, and of sums such as 0.1 + 0.2
 
 
 def at_noise(
     where: str, by_noise: Mapping[float, Sequence[Mapping[str, Any]]], noise: float, below: Sequence[Mapping[str, Any]]
 ) -> list[Mapping[str, Any]]:
     """
-    :param where: what has these arguments, for messages
-    :param by_noise: noise -> arguments there, the later over the earlier
-    :param noise: standard deviation that arguments are wanted for
-    :param below: arguments that hold where ``by_noise`` has none
-    :return: those of the same noise, but for rounding; none below the first noise, where ``below`` holds. Between two noises
-        numbers are interpolated, and all else is that of the nearer one; beyond the last it is the last one's. Either of
-        these is said in a warning
-    :raises ValueError: if the noise is negative, or no number
+    The arguments at a noise level.
+
+    Between two noise levels, numbers are interpolated, and other arguments are those of the nearer level; above the last level
+    the last level's arguments count. Both cause a warning.
+
+    :param where: name of the preset and task, for messages
+    :param by_noise: noise level -> layers of arguments, later ones over earlier ones
+    :param noise: standard deviation of the sensor noise
+    :param below: layers of arguments that hold where ``by_noise`` has none
+    :return: layers of arguments on top of ``below``; none if the noise is below all levels
+    :raises ValueError: if the noise is negative or no number
     """
     if not (_is_number(noise) and noise >= 0):
         raise ValueError(f"noise must be a number of at least 0, got {noise!r}.")
@@ -59,8 +62,8 @@ def _is_number(value: Any) -> bool:
 
 def defaults_of(algorithm: type) -> dict[str, Any]:
     """
-    :param algorithm: a class
-    :return: default values of its constructor's arguments, of those that have one
+    :param algorithm: class of an algorithm
+    :return: name -> default value, for the constructor's arguments that have one
     """
     parameters = inspect.signature(algorithm).parameters.values()
     return {parameter.name: parameter.default for parameter in parameters if parameter.default is not parameter.empty}
@@ -68,7 +71,10 @@ def defaults_of(algorithm: type) -> dict[str, Any]:
 
 def merged(layers: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """
-    :param layers: arguments, the later over the earlier
+    Merge layers of arguments.
+
+    :param layers: arguments, later ones over earlier ones
+    :return: merged arguments
     """
     result: dict[str, Any] = {}
     for layer in layers:
@@ -78,8 +84,11 @@ def merged(layers: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """
+    Merge two layers of arguments.
+
     :param below: arguments
-    :param above: what replaces them, key by key; ``policy_kwargs`` are merged
+    :param above: arguments that replace those of the same name; ``policy_kwargs`` are merged
+    :return: merged arguments
     """
     merged = dict(below)
     for key, value in above.items():

@@ -1,1 +1,1 @@
-"""What was seen, kept and sampled."""
+"""Replay buffers: how observations are stored and sampled."""

@@ -21,32 +21,32 @@ from sb3_gac.replay.shown import CUT, DONE, TIME_LIMIT, ShownByStep
 
 class CompactDictReplayBuffer(ShownByStep):
     """
-    A ring of observations: the next observation of a step is the observation of the following one.
+    A ring of observations: the next observation of a step is stored once, as the observation of the following step.
 
-    Only where an episode ends, or the environment was reset from outside, is a final observation kept apart.  One row
-    more than the capacity holds the newest next observation.  Exact for terminations, time limits and several
-    environments, and drops in for SB3's ``DictReplayBuffer``, which stores every observation twice. Of stacks of frames, named
-    in ``frame_stacks``, each frame is stored once.
+    A final observation is kept apart only where an episode ends, or where the environment was reset from outside.  One row
+    beyond the capacity holds the newest next observation.  The buffer is exact for terminations, time limits and several
+    environments, and replaces SB3's ``DictReplayBuffer``, which stores every observation twice.  Entries that are stacks of
+    frames are named in ``frame_stacks``, and each of their frames is stored once.
 
-    :param buffer_size: transitions kept, over all environments
-    :param observation_space: Dict
-    :param action_space: of the environments
-    :param device: of the samples
+    :param buffer_size: number of transitions kept, over all environments
+    :param observation_space: Dict space of observations
+    :param action_space: action space of the environments
+    :param device: device of the samples
     :param n_envs: number of environments
-    :param optimize_memory_usage: accepted, always so
-    :param handle_timeout_termination: whether a time limit bootstraps, instead of counting as termination
-    :param n_steps: rewards summed up in a sample; it ends early where the episode or the data do
+    :param optimize_memory_usage: argument of SB3's buffers, without effect, since this buffer stores observations once anyway
+    :param handle_timeout_termination: whether a time limit bootstraps, instead of counting as a termination
+    :param n_steps: number of rewards summed up in a sample; the sum ends early where the episode or the data end
     :param gamma: discount factor of that sum
-    :param storage_dtype: "float16" to store floating-point entries at half precision
+    :param storage_dtype: type that floating-point entries are stored in, such as "float16"; ``None`` for their own
     :param frame_stacks: entry -> number of its frames, joined along its first axis, the oldest first, as
         :class:`sb3_gac.envs.History` and SB3's ``VecFrameStack`` join them: ``{"partial": 3}``
-    :param mask_truncations: whether critics learn nothing from a step that ended by its time limit, instead of bootstrapping
-        from the observation that it ended with, which Brax's SAC does not have (``sac/losses.py``: the error times 1 -
-        truncation, in a mean over all); policies learn from it
-    :raises MemoryError: if the buffer can't fit into the memory that is available
+    :param mask_truncations: whether critics learn nothing from a step that the time limit truncated, as in Brax's SAC, whose
+        ``sac/losses.py`` multiplies the error by 1 - truncation and divides by the number of all steps; if not, critics
+        bootstrap from the final observation. Policies learn from such steps in either case
+    :raises MemoryError: if the buffer does not fit into the available memory
     """
 
-    #: Transitions that are not sampled any more, per environment, of all that were ever added
+    #: Number of steps, counted from the first step ever added, that are no longer sampled
     _n_retired = 0
     mask_truncations = False
 
@@ -78,7 +78,7 @@ class CompactDictReplayBuffer(ShownByStep):
         self.gamma = gamma
         lengths = resolve_frame_stacks(observation_space, frame_stacks)
         self.layout = ObservationLayout(observation_space, None if storage_dtype is None else np.dtype(storage_dtype), lengths)
-        self.n_rows = self.buffer_size + max(lengths.values(), default=1)  # the oldest one's frames are there, too
+        self.n_rows = self.buffer_size + max(lengths.values(), default=1)  # the frames of the oldest stack included
         action_dtype = np.dtype(self._maybe_cast_dtype(action_space.dtype))
         row_bytes = self.layout.row_bytes() + self.action_dim * action_dtype.itemsize + 5
         check_fits_in_memory(self.buffer_size * n_envs, self.n_rows * n_envs, row_bytes)
@@ -90,7 +90,7 @@ class CompactDictReplayBuffer(ShownByStep):
         self._n_added = 0
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Buffers of earlier versions have their rows themselves."""
+        """Restore a pickled buffer; buffers of earlier versions have no ring, and hold the rows themselves."""
         rows = state.pop("_rows", None)
         vars(self).update(state)
         if rows is not None:
@@ -100,20 +100,20 @@ class CompactDictReplayBuffer(ShownByStep):
     # --- sizes ------------------------------------------------------------------------------------------------------
 
     def nbytes(self) -> int:
-        """Bytes allocated."""
+        """Number of bytes allocated."""
         arrays = (self.actions, self.rewards, self.endings)
         return sum(array.nbytes for array in arrays) + self._ring.nbytes() + self._finals.nbytes()
 
     def size(self) -> int:
-        """Transitions kept per environment."""
+        """Number of transitions kept for each environment."""
         return min(self._n_added, self.buffer_size)
 
     def newest_rewards(self) -> np.ndarray:
-        """Of the step that was added last, shape (n_envs,)."""
+        """Rewards of the step that was added last, shape (n_envs,)."""
         return self.rewards[(self._n_added - 1) % self.n_rows]
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Forget all transitions."""
         super().reset()
         self._n_added = self._n_retired = 0
         self._finals = FinalObservations(self.layout)
@@ -124,23 +124,25 @@ class CompactDictReplayBuffer(ShownByStep):
 
     @property
     def n_added(self) -> int:
-        """Transitions ever added, per environment."""
+        """Number of transitions ever added for each environment."""
         return self._n_added
 
     def rows_by_name(self) -> dict[str, np.ndarray]:
-        """What the ring holds, by row: arrays of shape (rows, n_envs, \\*), not copied; a step writes its row and the next."""
+        """The ring's arrays by name, shape (rows, n_envs, \\*), not copied; a step writes its own row and the next one."""
         return {**self._ring.rows_by_name(), "actions": self.actions, "rewards": self.rewards, "endings": self.endings}
 
     def bookkeeping(self) -> dict[str, Any]:
-        """All else that there is, for :meth:`restore_bookkeeping`."""
+        """The buffer's state apart from :meth:`rows_by_name`, for :meth:`restore_bookkeeping`."""
         counts = {"n_added": self._n_added, "n_retired": self._n_retired}
         apart = {"finals": self._finals.state(), "frames": self._ring.state()}
         return {**counts, "shape": list(self.rewards.shape), **apart}
 
     def restore_bookkeeping(self, state: dict[str, Any]) -> None:
         """
-        :param state: of :meth:`bookkeeping`
-        :raises ValueError: if it is of a buffer of another size
+        Restore the state of another buffer.
+
+        :param state: state from :meth:`bookkeeping`
+        :raises ValueError: if the state is that of a buffer with another number of rows or environments
         """
         if state["shape"] != list(self.rewards.shape):
             raise ValueError(f"The buffer has (rows, environments) {list(self.rewards.shape)}, and had {state['shape']}.")
@@ -162,13 +164,16 @@ class CompactDictReplayBuffer(ShownByStep):
         infos: list[dict[str, Any]],
     ) -> None:
         """
-        :param obs: observations, one row per environment
-        :param next_obs: observations after the action; at an episode's end its last, not the next episode's first
-        :param action: shape (n_envs, \\*action shape)
-        :param reward: shape (n_envs,)
-        :param done: shape (n_envs,)
-        :param infos: with "TimeLimit.truncated" where a time limit ended the episode
-        :raises ValueError: naming the entry that does not fit, see :meth:`ObservationLayout.pack`; nothing is then stored
+        Add one transition of each environment.
+
+        :param obs: observations before the action, (n_envs, ...) of each entry
+        :param next_obs: observations after the action, (n_envs, ...) of each entry; at an episode's end its final observation,
+            not the next episode's first one
+        :param action: actions on the networks' scale, shape (n_envs, \\*action shape)
+        :param reward: rewards, shape (n_envs,)
+        :param done: true where the episode ended, shape (n_envs,)
+        :param infos: info of each environment, with "TimeLimit.truncated" where a time limit ended the episode
+        :raises ValueError: if an entry does not fit, see :meth:`ObservationLayout.pack`; nothing is then stored
         """
         rows, next_rows = self.layout.pack(obs, self.n_envs), self.layout.pack(next_obs, self.n_envs)
         self._ring.check_follows(rows, next_rows)
@@ -176,7 +181,7 @@ class CompactDictReplayBuffer(ShownByStep):
         goes_on = np.zeros(self.n_envs, dtype=bool)
         if self._n_added:
             goes_on = self._ring.goes_on(self._n_added, rows)
-            self._cut(~goes_on)  # someone did not say so
+            self._cut(~goes_on)  # a reset without mark_reset()
         self._ring.write(self._n_added, rows, goes_on)
         self.actions[self.pos] = np.reshape(action, (self.n_envs, self.action_dim))
         self.rewards[self.pos] = reward
@@ -194,17 +199,19 @@ class CompactDictReplayBuffer(ShownByStep):
         self._ring.forget_before(self._n_added - self.size())
 
     def mark_reset(self) -> None:
-        """Whoever resets the environments from outside says so: what was added last is not continued by what comes next."""
+        """Cut the episodes under way, after a reset from outside: the next step does not continue the last one."""
         if self._n_added:
             self._cut(np.ones(self.n_envs, dtype=bool))
 
     def retire(self) -> None:
-        """What is stored is not sampled from now on; it stays the history of what is to come."""
+        """Stop sampling the stored transitions; they remain in the histories of later transitions."""
         self._n_retired = self._n_added
 
     def _cut(self, envs: np.ndarray) -> None:
         """
-        :param envs: whether to cut what was added last, unless it ends an episode anyway, shape (n_envs,)
+        Mark the step that was added last as cut, unless it ended an episode.
+
+        :param envs: whether to cut the episode of each environment, shape (n_envs,)
         """
         previous = (self._n_added - 1) % self.n_rows
         cut = np.flatnonzero(envs & (self.endings[previous] == 0))
@@ -219,9 +226,11 @@ class CompactDictReplayBuffer(ShownByStep):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> DictReplayBufferSamples:  # type: ignore[override]
         """
-        :param batch_size: transitions, drawn uniformly with replacement, B
-        :param env: normalises observations and rewards
-        :return: tensors on the buffer's device, (B, ...) each
+        Transitions, drawn uniformly with replacement.
+
+        :param batch_size: number of transitions, B
+        :param env: ``VecNormalize`` that normalises observations and rewards; ``None`` for no normalisation
+        :return: tensors of the transitions on the buffer's device, (B, ...) of each
         """
         return self._get_samples(self._draw_steps(batch_size) % self.n_rows, env)
 
@@ -229,10 +238,12 @@ class CompactDictReplayBuffer(ShownByStep):
         self, batch_size: int, length: int, env: VecNormalize | None = None
     ) -> tuple[DictReplayBufferSamples, Histories]:
         """
-        :param batch_size: see :meth:`sample`
-        :param length: steps before each transition, K
-        :param env: see :meth:`sample`
-        :return: what :meth:`sample` draws, and what came before in the episodes, as far as it is stored
+        Transitions, drawn uniformly with replacement, and the steps before each in its episode.
+
+        :param batch_size: number of transitions, B
+        :param length: number of steps before each transition, K
+        :param env: ``VecNormalize`` that normalises observations and rewards; ``None`` for no normalisation
+        :return: transitions as from :meth:`sample`, and their histories, as far as these steps are stored
         """
         steps = self._draw_steps(batch_size)
         envs = np.random.randint(self.n_envs, size=batch_size)
@@ -271,7 +282,7 @@ class CompactDictReplayBuffer(ShownByStep):
         return samples if weights is None else WeightedSamples(*samples, weights)
 
     def _critic_weights(self, endings: np.ndarray) -> th.Tensor | None:
-        """Of steps that ended in these ways, if ``mask_truncations`` asks for it."""
+        """Weights of steps by their endings, 0 for truncated ones; ``None`` without ``mask_truncations``."""
         masked = self.mask_truncations
         return self.to_torch((endings & TIME_LIMIT == 0).astype(np.float32), copy=False) if masked else None
 
@@ -288,14 +299,15 @@ class CompactDictReplayBuffer(ShownByStep):
         self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """
-        :return: discounted reward sums, (B,); rows of the last steps summed up, (B,); discounts of what follows, (B,)
+        :return: discounted sums of rewards, rows of the last steps in the sums, and discounts of the next values, shape (B,)
+            each; ``None`` in place of the discounts if ``n_steps`` is 1
         """
         if self.n_steps == 1:
             return self._normalize_reward(self.rewards[rows, envs], env).astype(np.float32), rows, None
         indices = (rows[:, None] + np.arange(self.n_steps)) % self.n_rows
         ends = (self.endings[indices, envs[:, None]] != 0) | (indices == (self._n_added - 1) % self.n_rows)
         ends[:, -1] = True
-        count = ends.argmax(axis=1) + 1  # steps up to and including the first that ends
+        count = ends.argmax(axis=1) + 1  # steps up to and including the first one at which the sum ends
         powers = np.power(self.gamma, np.arange(self.n_steps + 1), dtype=np.float64)
         used = np.arange(self.n_steps) < count[:, None]
         rewards = self._normalize_reward(self.rewards[indices, envs[:, None]], env) * used @ powers[:-1]
@@ -303,12 +315,20 @@ class CompactDictReplayBuffer(ShownByStep):
         return rewards.astype(np.float32), last, powers[count].astype(np.float32)
 
     def _gather(self, rows: np.ndarray, envs: np.ndarray) -> Rows:
-        # Step for which a row was written: the latest one up to _n_added that falls on it
+        # The step that a row holds is the latest step up to _n_added that falls on the row
         return self._ring.gather(self._n_added - (self._n_added - rows) % self.n_rows, envs)
 
     def _next_rows(self, rows: np.ndarray, envs: np.ndarray, only_stored: bool = False, before: Rows | None = None) -> Rows:
-        """Packed next observations: the following row, or what was kept apart; ``before``: of these rows, if gathered."""
-        # Step at which a row was written: the latest one below _n_added that falls on it
+        """
+        Packed next observations: from the following rows, or from the final observations that are kept apart.
+
+        :param rows: rows of the transitions, shape (B,)
+        :param envs: environments of the transitions, shape (B,)
+        :param only_stored: whether rows of steps that are no longer stored are read without a final observation
+        :param before: packed observations of the same transitions; ``None`` if they were not gathered
+        :return: packed next observations, group -> shape (B, width)
+        """
+        # The step of a row is the latest step below _n_added that falls on the row
         steps = self._n_added - 1 - (self._n_added - 1 - rows) % self.n_rows
         following = self._ring.stored(steps + 1, envs)
         ended = self.endings[rows, envs] != 0
@@ -320,11 +340,11 @@ class CompactDictReplayBuffer(ShownByStep):
         return self._ring.with_older_frames(following, steps, envs, before)
 
     def to_torch(self, array: np.ndarray, copy: bool = True) -> th.Tensor:
-        """See SB3's ``to_torch``; the tensor is of a type that torch computes with."""
+        """The array as a tensor on the buffer's device, of a type that torch computes with, see SB3's ``to_torch``."""
         return super().to_torch(computable(array), copy)
 
     def _to_tensors(self, rows: Rows, env: VecNormalize | None) -> dict[str, th.Tensor]:
-        """One tensor per group, of which the entries are views; entry by entry only where they are normalised."""
+        """The entries as tensors: views of one tensor for each group, or a tensor for each entry if they are normalised."""
         if env is not None:
             normalized = self._normalize_obs(self.layout.unpack(rows), env)
             assert isinstance(normalized, dict)

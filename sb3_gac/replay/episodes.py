@@ -1,4 +1,4 @@
-"""Replay of whole episodes, or of parts of them, for policies that remember."""
+"""Replay of whole episodes, or of sequences within episodes, for policies with a memory."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,9 +14,9 @@ from sb3_gac.replay.shown import DONE, TIME_LIMIT
 
 class EpisodeIndex:
     """
-    Which episodes a ring holds: first in, first out, in arrays that grow.
+    An index of the episodes that a ring holds, first in, first out, in an array that grows.
 
-    One row per episode: environment, first step, number of steps; steps count from the buffer's start.
+    Each episode has a row: environment, first step, number of steps. Steps count from the first step ever added.
     """
 
     def __init__(self) -> None:
@@ -25,9 +25,11 @@ class EpisodeIndex:
 
     def append(self, env: int, first_step: int, length: int) -> None:
         """
-        :param env: its number
-        :param first_step: of the episode
-        :param length: in steps
+        Add an episode.
+
+        :param env: number of its environment
+        :param first_step: its first step
+        :param length: number of its steps
         """
         if self._end == len(self._rows):
             kept = self._rows[self._first : self._end]
@@ -39,8 +41,10 @@ class EpisodeIndex:
 
     def since(self, step: int) -> np.ndarray:
         """
-        :param step: earlier ones are gone
-        :return: the episodes that are whole, shape (E, 3)
+        The episodes that begin at a step or later; earlier ones may be forgotten.
+
+        :param step: oldest step that is still stored
+        :return: rows of the episodes that are whole, shape (number of episodes, 3)
         """
         while self._first < self._end and self._rows[self._first, 1] < step:
             self._first += 1
@@ -50,15 +54,15 @@ class EpisodeIndex:
 
 class EpisodeReplayBuffer(CompactDictReplayBuffer):
     """
-    :class:`CompactDictReplayBuffer`, sampled by episode, or by sequence within episodes.
+    A :class:`CompactDictReplayBuffer` that samples whole episodes, or sequences within episodes.
 
-    Episodes count once they have ended, for whatever reason, and as long as all of their steps are there.
+    An episode can be sampled after it has ended, for any reason, as long as all of its steps are stored.
 
-    :param args: of :class:`CompactDictReplayBuffer`
-    :param sequence_length: transitions that count in a sample, drawn uniformly over steps; ``None`` for whole episodes,
-        drawn uniformly over episodes
-    :param burn_in: up to so many transitions before those only bring memories up
-    :param kwargs: of :class:`CompactDictReplayBuffer`; ``n_steps`` must be 1
+    :param args: positional arguments of :class:`CompactDictReplayBuffer`
+    :param sequence_length: number of transitions in a sample that losses count, drawn uniformly over steps; ``None`` for whole
+        episodes, drawn uniformly over episodes
+    :param burn_in: largest number of transitions before these that only bring memories up to date
+    :param kwargs: keyword arguments of :class:`CompactDictReplayBuffer`; ``n_steps`` must be 1
     """
 
     def __init__(self, *args: Any, sequence_length: int | None = None, burn_in: int = 0, **kwargs: Any):
@@ -78,16 +82,16 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         self._episode_starts = np.zeros(self.n_envs, dtype=np.int64)
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Forget all transitions and episodes."""
         super().reset()
         self._forget_episodes()
 
     def bookkeeping(self) -> dict[str, Any]:
-        """See :meth:`CompactDictReplayBuffer.bookkeeping`."""
+        """The buffer's state apart from its rows, see :meth:`CompactDictReplayBuffer.bookkeeping`."""
         return super().bookkeeping() | {"episodes": self._episodes.since(0), "starts": self._episode_starts.copy()}
 
     def restore_bookkeeping(self, state: dict[str, Any]) -> None:
-        """See :meth:`CompactDictReplayBuffer.restore_bookkeeping`."""
+        """Restore the state of another buffer, see :meth:`CompactDictReplayBuffer.restore_bookkeeping`."""
         super().restore_bookkeeping(state)
         self._episodes = EpisodeIndex()
         for episode in state["episodes"].tolist():
@@ -103,19 +107,21 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """See :meth:`CompactDictReplayBuffer.add`."""
+        """Add one transition of each environment, see :meth:`CompactDictReplayBuffer.add`."""
         super().add(obs, next_obs, action, reward, done, infos)
-        self._index_ended(self._n_added - 2)  # may have been cut
+        self._index_ended(self._n_added - 2)  # super().add() may have cut this step
         self._index_ended(self._n_added - 1)
 
     def mark_reset(self) -> None:
-        """See :meth:`CompactDictReplayBuffer.mark_reset`."""
+        """Cut the episodes under way, after a reset from outside, see :meth:`CompactDictReplayBuffer.mark_reset`."""
         super().mark_reset()
         self._index_ended(self._n_added - 1)
 
     def _index_ended(self, step: int) -> None:
         """
-        :param step: one of the last two, or -1: episodes that end with it count from now on
+        Add the episodes that end with a step to the index.
+
+        :param step: one of the last two steps; -1 if there is none
         """
         if step < 0:
             return
@@ -126,7 +132,7 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
 
     @property
     def n_episodes(self) -> int:
-        """Whole episodes that can be sampled."""
+        """Number of whole episodes that can be sampled."""
         return len(self._whole_episodes())
 
     def _whole_episodes(self) -> np.ndarray:
@@ -134,10 +140,12 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceSamples:  # type: ignore[override]
         """
-        :param batch_size: sequences, B
-        :param env: normalises observations and rewards
-        :return: tensors on the buffer's device
-        :raises ValueError: if no episode is whole
+        Sequences from whole episodes, drawn with replacement.
+
+        :param batch_size: number of sequences, B
+        :param env: ``VecNormalize`` that normalises observations and rewards; ``None`` for no normalisation
+        :return: padded sequences, as tensors on the buffer's device
+        :raises ValueError: if the buffer holds no whole episode
         """
         episodes = self._whole_episodes()
         if not len(episodes):
@@ -149,7 +157,8 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
 
     def _choose(self, episodes: np.ndarray, batch_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """
-        :return: environments, first steps, numbers of steps and, of these, steps that only bring memories up; (B,) each
+        :return: environments, first steps, numbers of steps, and how many of these only bring memories up to date, shape (B,)
+            each
         """
         if self.sequence_length is None:
             envs, starts, lengths = episodes[np.random.randint(len(episodes), size=batch_size)].T
@@ -188,11 +197,11 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
 
     def _with_final(self, entry: th.Tensor, final: th.Tensor, lengths: np.ndarray, shape: tuple[int, ...]) -> th.Tensor:
         """
-        :param entry: at every step, shape (T * B, ...)
-        :param final: after each sequence's last step, shape (B, ...)
-        :param lengths: shape (B,)
-        :param shape: (T, B)
-        :return: shape (T + 1, B, ...), zeros after the final one
+        :param entry: observations' entry at every step, shape (T * B, ...)
+        :param final: the entry after each sequence's last step, shape (B, ...)
+        :param lengths: number of steps of each sequence, shape (B,)
+        :param shape: number of steps and of sequences, (T, B)
+        :return: the entry of each sequence with its final value, zeros after it, shape (T + 1, B, ...)
         """
         steps, batch = shape
         result = entry.new_zeros((steps + 1, batch, *entry.shape[1:]))
@@ -205,9 +214,11 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
 
 def check_learns_from_sequences(replay_buffer_class: type | None, n_steps: int) -> None:
     """
-    :param replay_buffer_class: of an algorithm with a recurrent policy, ``None`` for the default
-    :param n_steps: argument of the algorithm
-    :raises ValueError: naming what does not go with a recurrent policy
+    Check that an algorithm with a recurrent policy gets sequences.
+
+    :param replay_buffer_class: class of the algorithm's replay buffer, ``None`` for the default
+    :param n_steps: number of rewards summed up in a critic's target
+    :raises ValueError: if one of the two does not go with a recurrent policy; the message names it
     """
     if replay_buffer_class is not None and not issubclass(replay_buffer_class, EpisodeReplayBuffer):
         raise ValueError(

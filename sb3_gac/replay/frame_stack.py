@@ -1,4 +1,4 @@
-"""Entries that are stacks of frames, of which a ring of rows keeps each frame once."""
+"""Observation entries that are stacks of frames; a ring of rows stores each frame once."""
 
 from collections.abc import Mapping
 
@@ -8,7 +8,7 @@ from gymnasium import spaces
 from sb3_gac.checks.values import check_integer
 from sb3_gac.replay.observation_store import Rows, RowsApart
 
-#: In place of an age: the row's older frames are kept apart
+#: Value in place of an age for rows whose older frames are kept apart
 APART = 128
 OLDER = "older"
 LONGEST = APART - 1
@@ -16,10 +16,12 @@ LONGEST = APART - 1
 
 def resolve_frame_stacks(space: spaces.Dict, frame_stacks: Mapping[str, int] | None) -> dict[str, int]:
     """
-    :param space: of the observations
+    Check which entries are stacks of frames.
+
+    :param space: Dict space of observations
     :param frame_stacks: entry -> number of its frames, joined along its first axis, the oldest first; ``None`` for none
-    :return: those of more than one frame
-    :raises ValueError: naming the entry that is not there, or can't be of so many frames
+    :return: entry -> number of its frames, for entries of more than one frame
+    :raises ValueError: if an entry does not exist, or can't consist of so many frames; the message names the entry
     """
     for key, length in (frame_stacks or {}).items():
         name = f'frame_stacks["{key}"]'
@@ -34,33 +36,33 @@ def resolve_frame_stacks(space: spaces.Dict, frame_stacks: Mapping[str, int] | N
 
 class OlderFrames:
     """
-    Layout of what is kept apart of a stack.
+    The layout of the older frames of a stack, which are kept apart.
 
-    :param width: numbers of all its frames but the newest
-    :param dtype: of the frames
+    :param width: size of all frames of a stack but the newest, in numbers
+    :param dtype: type of the frames
     """
 
     def __init__(self, width: int, dtype: np.dtype):
         self.width, self.dtype = width, dtype
 
     def empty(self, *leading: int) -> Rows:
-        """See :meth:`ObservationLayout.empty`."""
+        """Rows of zeros, see :meth:`ObservationLayout.empty`."""
         return {OLDER: np.zeros((*leading, self.width), dtype=self.dtype)}
 
 
 class FrameStack:
     """
-    Puts together stacks of frames, of which each row of a ring has the newest.
+    The stacks of frames of one entry, put together from a ring whose rows hold the newest frame of each stack.
 
-    A row's older frames are the newest ones of the rows before it, as many as its ``ages`` say; what is older than that is the
-    first of these over and over, as :class:`sb3_gac.envs.History` begins an episode, or is kept apart where it was other than
-    that.
+    The older frames of a row are the newest frames of the rows before it; the row's ``ages`` say of how many rows. Frames
+    older than these repeat the first of them, as :class:`sb3_gac.envs.History` does at an episode's start. Stacks that begin
+    otherwise have their older frames kept apart.
 
-    :param key: the entry, for messages
-    :param length: frames of a stack, L
-    :param width: numbers of a frame, W
-    :param dtype: of the frames
-    :param n_rows: of the ring
+    :param key: name of the entry, for messages
+    :param length: number of frames of a stack, L
+    :param width: size of a frame in numbers, W
+    :param dtype: type of the frames
+    :param n_rows: number of rows of the ring
     :param n_envs: number of environments
     """
 
@@ -71,20 +73,22 @@ class FrameStack:
         self.apart = RowsApart(self._layout)
 
     def nbytes(self) -> int:
-        """Bytes allocated."""
+        """Number of bytes allocated."""
         return self.ages.nbytes + self.apart.nbytes()
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Forget the frames that are kept apart."""
         self.apart = RowsApart(self._layout)
 
     # --- adding ------------------------------------------------------------------------------------------------------
 
     def check_follows(self, stacks: np.ndarray, next_stacks: np.ndarray) -> None:
         """
-        :param stacks: shape (n_envs, L * W)
-        :param next_stacks: after the step, shape (n_envs, L * W)
-        :raises ValueError: if the older frames of a next stack are not the newer ones of the stack before
+        Check that each next stack continues the stack before it.
+
+        :param stacks: stacks before the step, shape (n_envs, L * W)
+        :param next_stacks: stacks after the step, shape (n_envs, L * W)
+        :raises ValueError: if the older frames of a next stack are not the newer frames of the stack before it
         """
         if not np.array_equal(stacks[:, self.width :], next_stacks[:, : -self.width]):
             raise ValueError(
@@ -95,14 +99,14 @@ class FrameStack:
 
     def begin(self, step: int, goes_on: np.ndarray, stacks: np.ndarray) -> None:
         """
-        Rows whose older frames may be others than those of the rows before.
+        Write the older frames of rows that do not continue the rows before them.
 
-        :param step: at which they are observed
-        :param goes_on: where they are not, shape (n_envs,)
-        :param stacks: shape (n_envs, L * W)
+        :param step: step at which the stacks are observed
+        :param goes_on: true where a stack continues the row before, shape (n_envs,)
+        :param stacks: stacks of the step, shape (n_envs, L * W)
         """
         n_rows, n_envs = self.ages.shape
-        self.apart.forget_from(step * n_envs)  # of a step whose storing was interrupted
+        self.apart.forget_from(step * n_envs)  # left from a step whose storing was interrupted
         envs = np.flatnonzero(~goes_on | (self.ages[step % n_rows] >= APART))
         frames = stacks[envs].reshape(-1, self.length, self.width)
         repeated = (frames[:, :-1] == frames[:, -1:]).all(axis=(1, 2))
@@ -112,7 +116,9 @@ class FrameStack:
 
     def follow(self, step: int) -> None:
         """
-        :param step: whose rows have one more frame than those of the step before
+        Write the ages of rows that continue the rows before them.
+
+        :param step: step of these rows
         """
         n_rows = len(self.ages)
         before = self.ages[(step - 1) % n_rows] % APART
@@ -122,10 +128,12 @@ class FrameStack:
 
     def gather(self, frames: np.ndarray, steps: np.ndarray, envs: np.ndarray) -> np.ndarray:
         """
-        :param frames: the newest ones, by row, shape (rows, n_envs, W)
-        :param steps: of the rows that are asked for, shape (B,)
-        :param envs: shape (B,)
-        :return: shape (B, L * W)
+        Put stacks together.
+
+        :param frames: newest frames by row, shape (rows, n_envs, W)
+        :param steps: steps of the stacks, shape (B,)
+        :param envs: environments of the stacks, shape (B,)
+        :return: stacks, shape (B, L * W)
         """
         n_rows, n_envs = self.ages.shape
         ages = self.ages[steps % n_rows, envs] % APART
@@ -137,10 +145,10 @@ class FrameStack:
 
     def _put_in_what_is_apart(self, stacks: np.ndarray, starts: np.ndarray, envs: np.ndarray, ages: np.ndarray) -> None:
         """
-        :param stacks: shape (B, L, W), changed in place
-        :param starts: the steps at which their oldest rows were observed, shape (B,)
-        :param envs: shape (B,)
-        :param ages: shape (B,)
+        :param stacks: stacks, shape (B, L, W), changed in place
+        :param starts: steps of the oldest rows that the stacks come from, shape (B,)
+        :param envs: environments of the stacks, shape (B,)
+        :param ages: ages of the stacks' rows, shape (B,)
         """
         n_rows, n_envs = self.ages.shape
         is_apart = (self.ages[starts % n_rows, envs] >= APART) & (ages < self.length - 1)

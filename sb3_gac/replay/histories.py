@@ -1,4 +1,4 @@
-"""What came before a transition, in its episode."""
+"""Histories: the steps before a transition in its episode."""
 
 from typing import NamedTuple
 
@@ -10,8 +10,8 @@ class Histories(NamedTuple):
     """
     The K steps before each of B transitions, the oldest first; zeros before the episode's start.
 
-    :param observations: dict of entries, (K, B, ...) of each
-    :param actions: that followed them, in [-1, 1], shape (K, B, A), or numbers of actions, shape (K, B, 1)
+    :param observations: observations of these steps, (K, B, ...) of each entry
+    :param actions: actions of these steps, in [-1, 1], shape (K, B, A), or numbers of discrete actions, shape (K, B, 1)
     :param mask: 1 for steps of the transition's own episode, 0 before its start, shape (K, B)
     """
 
@@ -22,9 +22,12 @@ class Histories(NamedTuple):
     @classmethod
     def of(cls, entries: dict[str, th.Tensor], actions: th.Tensor, mask: th.Tensor) -> "Histories":
         """
-        :param entries: dict of entries, (K * B, ...) of each, whatever they are before an episode's start
-        :param actions: shape (K, B, A)
-        :param mask: shape (K, B)
+        Histories whose observations are set to zero before an episode's start.
+
+        :param entries: observations, (K * B, ...) of each entry, with any values before an episode's start
+        :param actions: actions, shape (K, B, A), zero before an episode's start
+        :param mask: 1 for steps of the transition's own episode, 0 before its start, shape (K, B)
+        :return: histories of B transitions
         """
         observations = {key: entry.unflatten(0, mask.shape) for key, entry in entries.items()}
         ones = {key: mask.view(*mask.shape, *[1] * (entry.dim() - 2)) for key, entry in observations.items()}
@@ -33,8 +36,10 @@ class Histories(NamedTuple):
 
 def check_samples_histories(replay_buffer_class: type | None) -> None:
     """
-    :param replay_buffer_class: of an algorithm whose batches have histories, ``None`` for the default
-    :raises ValueError: if it can't sample them
+    Check that an algorithm whose batches have histories gets them.
+
+    :param replay_buffer_class: class of the algorithm's replay buffer, ``None`` for the default
+    :raises ValueError: if the class can't sample histories
     """
     if replay_buffer_class is not None and not hasattr(replay_buffer_class, "sample_with_histories"):
         raise ValueError(
@@ -45,16 +50,16 @@ def check_samples_histories(replay_buffer_class: type | None) -> None:
 
 def steps_before(steps: np.ndarray, length: int) -> np.ndarray:
     """
-    :param steps: of transitions, shape (B,)
-    :param length: K
-    :return: the steps before each, the oldest first, shape (K, B)
+    :param steps: steps of transitions, shape (B,)
+    :param length: number of steps before each transition, K
+    :return: steps before each transition, the oldest first, shape (K, B)
     """
     return steps - np.arange(length, 0, -1)[:, None]
 
 
 def unbroken(goes_on: np.ndarray) -> np.ndarray:
     """
-    :param goes_on: whether the episode goes on after each of the steps, the oldest first, shape (K, B)
-    :return: whether it does after that and all later ones, shape (K, B)
+    :param goes_on: whether the episode goes on after each step, the oldest step first, shape (K, B)
+    :return: whether the episode goes on after a step and after all later steps, shape (K, B)
     """
     return np.logical_and.accumulate(goes_on[::-1], axis=0)[::-1]

@@ -1,4 +1,4 @@
-"""Where a replay buffer keeps dict observations: each once, all entries of a row side by side."""
+"""Storage of a replay buffer for dict observations: each observation once, the entries of a row side by side."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -14,13 +14,15 @@ Rows = dict[str, np.ndarray]
 
 class ObservationLayout:
     """
-    Packs a dict observation into one row per group, so that a batch is gathered in one call for all entries of a group: those
-    that are stored in the same type, or a stack of frames, of which a row of its own holds the newest one alone.
+    The layout of dict observations in rows, one row for each group of entries, so that one call gathers a batch of a group.
 
-    :param space: of the observations
-    :param float_dtype: how floating-point entries are stored, ``None`` for their own type
+    A group holds all entries that are stored in the same type, or a single entry that is a stack of frames. A stored row of a
+    stack holds its newest frame alone.
+
+    :param space: Dict space of observations
+    :param float_dtype: type that floating-point entries are stored in, ``None`` for their own type
     :param frame_stacks: entry -> number of its frames, see :func:`sb3_gac.replay.frame_stack.resolve_frame_stacks`
-    :raises ValueError: if that is no floating-point type
+    :raises ValueError: if ``float_dtype`` is no floating-point type
     """
 
     def __init__(self, space: spaces.Dict, float_dtype: np.dtype | None = None, frame_stacks: Mapping[str, int] | None = None):
@@ -32,7 +34,7 @@ class ObservationLayout:
         self.columns: dict[str, tuple[str, slice]] = {}
         self.widths: dict[str, int] = {}
         self.group_dtypes: dict[str, np.dtype] = {}
-        #: Group -> frames of its entry, of which one is stored
+        #: Group -> number of frames of its entry, for groups of which a row stores one frame
         self.lengths: dict[str, int] = {}
         for key, shape in self.shapes.items():
             is_float = np.issubdtype(self.dtypes[key], np.floating)
@@ -47,43 +49,50 @@ class ObservationLayout:
             self.columns[key] = (group, slice(start, self.widths[group]))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Buffers of earlier versions do not say which shapes they were given, and have no stacks of frames."""
+        """Restore a pickled layout; layouts of earlier versions lack the given shapes and have no stacks of frames."""
         given = {key: () if shape == (1,) else shape for key, shape in state["shapes"].items()}
         dtypes = {group: np.dtype(group) for group in state["widths"]} if "group_dtypes" not in state else {}
         vars(self).update({"_given_shapes": given, "group_dtypes": dtypes, "lengths": {}, **state})
 
     def stored_width(self, group: str) -> int:
         """
-        :param group: of the layout
-        :return: its last columns that a row of the ring holds: all, or of a stack those of its newest frame
+        :param group: name of a group
+        :return: number of columns that a row of the ring stores: all, or for a stack those of its newest frame, which are the
+            last
         """
         return self.widths[group] // self.lengths.get(group, 1)
 
     def row_bytes(self) -> int:
-        """Bytes of what is stored of one observation, the ages of stacks included."""
+        """Number of bytes stored for one observation, the ages of stacks included."""
         return sum(self.stored_width(group) * dtype.itemsize for group, dtype in self.group_dtypes.items()) + len(self.lengths)
 
     def empty(self, *leading: int) -> Rows:
         """
+        Rows of zeros.
+
         :param leading: dimensions before the columns
-        :return: group -> zeros of shape (\\*leading, stored width)
+        :return: stored rows, group -> zeros of shape (\\*leading, stored width)
         """
         return {group: np.zeros((*leading, self.stored_width(group)), dtype) for group, dtype in self.group_dtypes.items()}
 
     def stored(self, rows: Rows) -> Rows:
         """
-        :param rows: group -> shape (n, width)
-        :return: what is stored of them, group -> shape (n, stored width)
+        The part of packed observations that is stored.
+
+        :param rows: packed observations, group -> shape (n, width)
+        :return: stored rows, group -> shape (n, stored width)
         """
         return {group: values[:, self.widths[group] - self.stored_width(group) :] for group, values in rows.items()}
 
     def pack(self, observation: Mapping[str, np.ndarray], n_rows: int) -> Rows:
         """
-        :param observation: ``n_rows`` of each entry
+        Pack observations.
+
+        :param observation: observations, (n_rows, ...) of each entry
         :param n_rows: number of environments
-        :return: group -> shape (n_rows, width)
-        :raises ValueError: naming the entry that is missing, unknown or of another shape, or that holds a number too large
-            for the type it is stored in
+        :return: packed observations, group -> shape (n_rows, width)
+        :raises ValueError: if an entry is missing, unknown or of another shape, or holds a number that is too large for the
+            type it is stored in; the message names the entry
         """
         if observation.keys() != self.columns.keys():
             raise ValueError(
@@ -105,8 +114,11 @@ class ObservationLayout:
 
     def unpack(self, rows: Rows) -> dict[str, np.ndarray]:
         """
-        :param rows: group -> shape (\\*leading, width)
-        :return: entry -> shape (\\*leading, \\*entry shape), in the entry's own type; views where the type is stored as it is
+        Unpack observations.
+
+        :param rows: packed observations, group -> shape (\\*leading, width)
+        :return: observations, entry -> shape (\\*leading, \\*entry shape), in the entry's own type; a view if it is stored in
+            that type
         """
         observation = {}
         for key, (group, columns) in self.columns.items():
@@ -117,7 +129,12 @@ class ObservationLayout:
 
 def _check_range(key: str, values: np.ndarray, stored: np.dtype) -> None:
     """
-    :raises ValueError: if one of the values is infinite in the type that it is to be stored in
+    Check that an entry's values are finite in the type that they are stored in.
+
+    :param key: name of the entry
+    :param values: values of the entry
+    :param stored: type that they are stored in
+    :raises ValueError: if a value is beyond the largest number of that type
     """
     if stored.kind != "f" or np.can_cast(values.dtype, stored):
         return
@@ -133,10 +150,12 @@ def _check_range(key: str, values: np.ndarray, stored: np.dtype) -> None:
 
 def check_fits_in_memory(n_transitions: int, n_rows: int, row_bytes: int) -> None:
     """
-    :param n_transitions: that a buffer is to hold
-    :param n_rows: that it needs for them, of all environments
-    :param row_bytes: of each
-    :raises MemoryError: with the numbers, if the memory that is available is less
+    Check that a buffer fits into the available memory.
+
+    :param n_transitions: number of transitions that the buffer is to hold
+    :param n_rows: number of rows that the buffer needs, over all environments
+    :param row_bytes: size of a row, in bytes
+    :raises MemoryError: if less memory is available than the buffer needs; the message has the numbers
     """
     needed, available = row_bytes * n_rows, psutil.virtual_memory().available
     if needed > available:
@@ -148,17 +167,18 @@ def check_fits_in_memory(n_transitions: int, n_rows: int, row_bytes: int) -> Non
 
 
 class RowLayout(Protocol):
-    """What rows consist of."""
+    """The layout of rows by group."""
 
     def empty(self, *leading: int) -> Rows:
-        """See :meth:`ObservationLayout.empty`."""
+        """Rows of zeros, see :meth:`ObservationLayout.empty`."""
 
 
 class RowsApart:
     """
-    Rows that a ring does not hold, each with a time. First in, first out, as the ring overwrites what they belong to.
+    Rows that are kept apart from a ring, each with a time. They are forgotten first in, first out, as the ring overwrites the
+    steps that they belong to.
 
-    :param layout: of the rows
+    :param layout: layout of the rows
     """
 
     def __init__(self, layout: RowLayout):
@@ -171,25 +191,29 @@ class RowsApart:
         return self._end - self._first
 
     def nbytes(self) -> int:
-        """Bytes allocated."""
+        """Number of bytes allocated."""
         return self._times.nbytes + sum(rows.nbytes for rows in self._rows.values())
 
     def state(self) -> dict[str, Any]:
-        """What is kept, copied."""
+        """The times and rows that are kept, copied."""
         kept = slice(self._first, self._end)
         return {"times": self._times[kept].copy(), "rows": {group: rows[kept].copy() for group, rows in self._rows.items()}}
 
     def restore(self, state: dict[str, Any]) -> None:
         """
-        :param state: of :meth:`state`
+        Restore the state of another store.
+
+        :param state: state from :meth:`state`
         """
         self._times, self._rows = state["times"], state["rows"]
         self._first, self._end = 0, len(self._times)
 
     def append(self, times: np.ndarray, rows: Rows) -> None:
         """
-        :param times: increasing, and not before the latest step that was appended, shape (n,)
-        :param rows: group -> shape (n, width)
+        Add rows.
+
+        :param times: times of the rows, in increasing order, none before the latest step that was appended, shape (n,)
+        :param rows: rows to add, group -> shape (n, width)
         """
         count = len(times)
         if self._end + count > len(self._times):
@@ -204,26 +228,31 @@ class RowsApart:
 
     def forget_before(self, time: int) -> None:
         """
-        :param time: whatever was appended with an earlier time is not needed any more
+        Forget the oldest rows.
+
+        :param time: time before which rows are no longer needed
         """
         self._first += int(np.searchsorted(self._times[self._first : self._end], time))
 
     def forget_from(self, time: int) -> None:
         """
-        :param time: whatever was appended with it or a later one does not count: it is of a step whose storing was
-            interrupted
+        Forget the newest rows, which are left from a step whose storing was interrupted.
+
+        :param time: time from which on rows are forgotten
         """
         self._end = self._first + int(np.searchsorted(self._times[self._first : self._end], time))
 
     @property
     def rows(self) -> Rows:
-        """Group -> shape (allocated, width); which of them are whose, :meth:`find` says."""
+        """All allocated rows, group -> shape (allocated, width), at the places that :meth:`find` returns."""
         return self._rows
 
     def find(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        :param times: under which rows may have been appended, shape (B,)
-        :return: their places in :attr:`rows`, and whether they are there, shape (B,)
+        Find rows by their times.
+
+        :param times: times of the rows, shape (B,)
+        :return: places of the rows in :attr:`rows`, and whether there is a row of that time, shape (B,) each
         """
         kept = self._times[self._first : self._end]
         index = np.searchsorted(kept, times)
@@ -233,9 +262,11 @@ class RowsApart:
 
     def replace_in(self, rows: Rows, positions: np.ndarray, times: np.ndarray) -> None:
         """
-        :param rows: group -> shape (B, width), changed in place
-        :param positions: which of the B rows are to be replaced
-        :param times: under which their replacements were appended
+        Replace some of B rows by rows that are kept here.
+
+        :param rows: rows, group -> shape (B, width), changed in place
+        :param positions: positions of the rows that are replaced, shape (n,)
+        :param times: times of their replacements, shape (n,)
         """
         index = self._first + np.searchsorted(self._times[self._first : self._end], times)
         for group, values in rows.items():
@@ -249,7 +280,7 @@ class RowsApart:
             values[kept] = values[kept][order]
 
     def _make_room(self, count: int) -> None:
-        """Move what is kept to the front, in new arrays if it fills more than half: amortised constant time."""
+        """Move the kept rows into new arrays with twice the room needed, so that appending takes amortised constant time."""
         kept = slice(self._first, self._end)
         size = max(2 * (len(self) + count), 16)
         times, rows = np.empty(size, dtype=np.int64), self._layout.empty(size)
@@ -260,4 +291,4 @@ class RowsApart:
 
 
 class FinalObservations(RowsApart):
-    """The observations that no later row holds: those at episode ends."""
+    """The final observations of episodes, which no row of the ring holds."""

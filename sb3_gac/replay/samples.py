@@ -1,4 +1,4 @@
-"""What replay buffers give, where SB3 has no type for it."""
+"""Types of samples from replay buffers that SB3 does not have."""
 
 from typing import NamedTuple
 
@@ -7,9 +7,9 @@ import torch as th
 
 class WeightedSamples(NamedTuple):
     """
-    SB3's ``DictReplayBufferSamples``, and how much critics learn from each.
+    SB3's ``DictReplayBufferSamples`` with weights for the critics' losses.
 
-    :param critic_weights: 0 for what ended by a time limit, else 1, shape (B,)
+    :param critic_weights: 0 for transitions that a time limit truncated, else 1, shape (B,)
     """
 
     observations: dict[str, th.Tensor]
@@ -25,12 +25,14 @@ class SequenceSamples(NamedTuple):
     """
     B sequences of up to T transitions, padded with zeros at their ends.
 
-    :param observations: dict of entries, (T + 1, B, ...) of each: the last valid one is the last next observation
-    :param actions: shape (T, B, A)
-    :param rewards: shape (T, B)
-    :param dones: 1 where the episode terminated, shape (T, B)
-    :param mask: 1 for what counts, 0 for padding and for the steps before it that only bring memories up, shape (T, B)
-    :param critic_weights: 0 for what ended by a time limit, else 1, shape (T, B), if ``mask_truncations`` asks for it
+    :param observations: observations and the final next observation of each sequence, (T + 1, B, ...) of each entry
+    :param actions: actions in [-1, 1], shape (T, B, A), or numbers of discrete actions, shape (T, B, 1)
+    :param rewards: rewards, shape (T, B)
+    :param dones: 1 where the episode terminated, else 0, shape (T, B)
+    :param mask: 1 for transitions that losses count, 0 for padding and for transitions that only bring memories up to date,
+        shape (T, B)
+    :param critic_weights: 0 for transitions that a time limit truncated, else 1, shape (T, B); ``None`` without
+        ``mask_truncations``
     """
 
     observations: dict[str, th.Tensor]

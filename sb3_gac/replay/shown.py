@@ -1,4 +1,4 @@
-"""What a replay buffer that stores each observation once shows of itself: arrays by step, as SB3's buffers have them."""
+"""Arrays by step, as SB3's buffers have them, for a replay buffer that stores each observation once."""
 
 from collections.abc import Callable
 
@@ -7,12 +7,12 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 
 from sb3_gac.replay.observation_store import ObservationLayout, Rows
 
-#: Of ``endings``: an episode ended; by its time limit; it was cut off, as by a reset from outside
+#: Flags of ``endings``: the episode ended; its time limit ended it; it was cut off, as by a reset from outside
 DONE, TIME_LIMIT, CUT = 1, 2, 4
 
 
 class ShownByStep(DictReplayBuffer):
-    """Arrays that are put together when somebody asks for them."""
+    """A replay buffer whose arrays are put together at each access."""
 
     n_rows: int
     layout: ObservationLayout
@@ -22,12 +22,12 @@ class ShownByStep(DictReplayBuffer):
 
     @property
     def observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
-        """Entry -> shape (rows, n_envs, \\*entry shape); the row at ``pos`` is the newest next observation."""
+        """Observations, entry -> shape (rows, n_envs, \\*entry shape); the row at ``pos`` is the newest next observation."""
         return self._everywhere(self._gather)
 
     @property
     def next_observations(self) -> dict[str, np.ndarray]:  # type: ignore[override]
-        """Entry -> shape (rows, n_envs, \\*entry shape), put together for inspection."""
+        """Next observations, entry -> shape (rows, n_envs, \\*entry shape)."""
         return self._everywhere(lambda rows, envs: self._next_rows(rows, envs, only_stored=True))
 
     def _everywhere(self, gather: Callable[[np.ndarray, np.ndarray], Rows]) -> dict[str, np.ndarray]:
@@ -36,10 +36,10 @@ class ShownByStep(DictReplayBuffer):
 
     @property
     def dones(self) -> np.ndarray:  # type: ignore[override]
-        """1 where an episode ended, for whatever reason, shape (rows, n_envs)."""
+        """1 where an episode ended by termination or time limit, else 0, shape (rows, n_envs)."""
         return (self.endings & DONE).astype(np.float32)
 
     @property
     def timeouts(self) -> np.ndarray:  # type: ignore[override]
-        """1 where it ended by its time limit, shape (rows, n_envs)."""
+        """1 where an episode ended by its time limit, else 0, shape (rows, n_envs)."""
         return (self.endings & TIME_LIMIT > 0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What a replay buffer gets of vectorised environments: raw observations where these can be normalised anew."""
+"""The source of a replay buffer's data: raw observations of vectorised environments, where these can be normalised later."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,15 +19,15 @@ from sb3_gac.checks.environments import FINAL, RAW_FINAL
 from sb3_gac.checks.observations import InvalidStepError, check_observation, entries_in
 
 Entries = dict[str, np.ndarray]
-#: Wrappers that hand on observations as they are
+#: Wrappers that do not change observations
 OBSERVERS = (VecMonitor, VecVideoRecorder, VecCheckNan)
 
 
 class RewardNormalizer:
     """
-    A ``VecNormalize`` for observations that were stored as they were seen, that is, normalised: rewards alone are left to do.
+    A ``VecNormalize`` that normalises rewards alone, for observations that were stored in normalised form.
 
-    :param normalizer: whose rewards these are
+    :param normalizer: ``VecNormalize`` with the statistics of the rewards
     """
 
     def __init__(self, normalizer: VecNormalize):
@@ -35,27 +35,30 @@ class RewardNormalizer:
 
     def normalize_obs(self, obs: Any) -> Any:
         """
-        :param obs: as they were seen
-        :return: the same
+        :param obs: observations in normalised form
+        :return: the same observations
         """
         return obs
 
     def normalize_reward(self, reward: np.ndarray) -> np.ndarray:
         """
-        :param reward: raw
-        :return: normalised with the newest statistics
+        :param reward: raw rewards
+        :return: rewards normalised with the newest statistics, of the same shape
         """
         return self._normalizer.normalize_reward(reward)
 
 
 class ReplaySource:
     """
-    Under ``VecNormalize`` a buffer holds raw observations, which are normalised with the newest statistics when they are
-    sampled. Wrappers further out decide whether that can be: images that are transposed out there are transposed here as
-    well; where another wrapper changes observations (``VecFrameStack``, or one that nothing is known of), what the networks
-    see is stored as they see it. Rewards are raw in any case: where such a wrapper changes them, VecNormalize must not.
+    The source of observations and rewards for a replay buffer.
 
-    :param env: vectorised environments, as the networks see them
+    With ``VecNormalize`` a buffer holds raw observations, which are normalised with the newest statistics when they are
+    sampled. Wrappers outside of ``VecNormalize`` decide whether raw observations can be stored. Where a wrapper transposes
+    images, the raw images are transposed here as well. Where another wrapper changes observations (``VecFrameStack``, or an
+    unknown wrapper), observations are stored as the networks see them. Rewards are always stored raw: where such a wrapper
+    changes them, ``VecNormalize`` must not normalise them.
+
+    :param env: vectorised environments that return what the networks see
     """
 
     def __init__(self, env: VecEnv):
@@ -64,31 +67,33 @@ class ReplaySource:
         outside = [] if self.normalizer is None else _wrappers_outside(env, self.normalizer)
         changing = [wrapper for wrapper in outside if type(wrapper) not in OBSERVERS]
         self._transposers = [wrapper for wrapper in reversed(changing) if type(wrapper) is VecTransposeImage]
-        #: The wrapper because of which observations are stored as they are seen, ``None`` if there is none
+        #: Wrapper that prevents raw observations from being stored, ``None`` if there is none
         self.in_the_way = next((wrapper for wrapper in changing if type(wrapper) is not VecTransposeImage), None)
 
         self._entries = entries_in(env.observation_space)
 
     @property
     def is_raw(self) -> bool:
-        """Whether what is stored is still to be normalised."""
+        """Whether stored observations are raw, and are to be normalised when they are sampled."""
         return self.normalizer is not None and self.in_the_way is None
 
     @property
     def sampling_env(self) -> Any:
-        """What is to be passed to ``ReplayBuffer.sample``: normalises what is stored raw."""
+        """The normaliser of samples, to pass to ``ReplayBuffer.sample``; ``None`` without ``VecNormalize``."""
         if self.normalizer is None or self.is_raw:
             return self.normalizer
         return RewardNormalizer(self.normalizer)
 
     def observation(self, seen: Mapping[str, np.ndarray]) -> Entries:
         """
-        :param seen: what the environments have just returned, (n_envs, ...) of each entry
-        :return: what is to be stored of it; no later step changes these arrays
-        :raises InvalidStepError: if a wrapper outside ``VecNormalize`` made something of it that can't be stored
+        The observations to store.
+
+        :param seen: observations that the environments have just returned, (n_envs, ...) of each entry
+        :return: observations to store, (n_envs, ...) of each entry, in arrays that no later step changes
+        :raises InvalidStepError: if a wrapper outside of ``VecNormalize`` returned an observation that can't be stored
         """
         if self.in_the_way is not None:
-            check_observation(seen, self._entries)  # as the guard does beneath
+            check_observation(seen, self._entries)  # as the guard does for the environments inside
         if not self.is_raw:
             return {key: np.array(values) for key, values in seen.items()}
         assert self.normalizer is not None
@@ -96,11 +101,13 @@ class ReplaySource:
 
     def final(self, info: Mapping[str, Any]) -> Mapping[str, np.ndarray]:
         """
-        :param info: of an environment whose episode has just ended
-        :return: what is to be stored of that episode's last observation
-        :raises InvalidStepError: if a wrapper ended the episode and did not say what it was
+        The final observation to store.
+
+        :param info: info of an environment whose episode has just ended
+        :return: final observation of the episode, in the form in which observations are stored
+        :raises InvalidStepError: if a wrapper ended the episode and left the final observation out of ``info``
         """
-        # VecNormalize's own, normalised and then undone, would be clipped and rounded
+        # Undoing VecNormalize's normalisation would leave the final observation clipped and rounded
         if self.is_raw:
             return self._transposed(info[RAW_FINAL])
         if FINAL not in info:
@@ -112,9 +119,11 @@ class ReplaySource:
 
     def reward(self, seen: np.ndarray) -> np.ndarray:
         """
-        :param seen: what the environments have just returned, shape (n_envs,)
-        :return: raw
-        :raises ValueError: if a wrapper changed rewards after they were normalised
+        The rewards to store.
+
+        :param seen: rewards that the environments have just returned, shape (n_envs,)
+        :return: raw rewards, shape (n_envs,)
+        :raises ValueError: if a wrapper changed rewards after ``VecNormalize`` normalised them
         """
         if self.normalizer is None:
             return seen
@@ -136,7 +145,7 @@ class ReplaySource:
 
 
 def _wrappers_outside(env: Any, normalizer: VecNormalize) -> list[VecEnvWrapper]:
-    """Outermost first."""
+    """The wrappers outside of ``VecNormalize``, the outermost first."""
     found = []
     while env is not normalizer:
         found.append(env)

@@ -1,4 +1,4 @@
-"""The paper's theory on arrays, with numpy alone: guided policy iteration, its relatives, and what its pull is."""
+"""The paper's theory on arrays, with numpy alone: guided policy iteration, related steps, and the pull between Gaussians."""
 
 from sb3_gac.tabular.gaussian import ascent, coefficient_for, guider_optimum, pull
 from sb3_gac.tabular.improvement import (

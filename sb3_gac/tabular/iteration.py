@@ -1,4 +1,4 @@
-"""Guided policy iteration: evaluation and improvement in turn, Theorem 3.3."""
+"""Guided policy iteration (Theorem 3.3): policy evaluation and policy improvement in turn."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,11 +14,11 @@ DISTILLATION, OWN_CRITIC = "distillation", "own critic"
 
 class GuidedIterate(NamedTuple):
     """
-    Both policies, and the guided values that they have together.
+    The policies of one iteration and their guided values.
 
-    :param guider: shape (S, A)
-    :param learner: shape (O, A)
-    :param values: Q, shape (S, A)
+    :param guider: the guider's probabilities of actions by state, shape (S, A)
+    :param learner: the learner's probabilities of actions by observation, shape (O, A)
+    :param values: guided Q of the two policies, shape (S, A)
     """
 
     guider: np.ndarray
@@ -28,8 +28,8 @@ class GuidedIterate(NamedTuple):
 
 def uniform_learner(pomdp: TabularPOMDP) -> np.ndarray:
     """
-    :param pomdp: with O observations and A actions
-    :return: the learner that takes each action as often, shape (O, A)
+    :param pomdp: decision process with O observations and A actions
+    :return: probabilities of the learner that takes all actions equally often, shape (O, A)
     """
     _, actions, observations = pomdp.shape
     return np.full((observations, actions), 1.0 / actions)
@@ -43,16 +43,18 @@ def guided_policy_iteration(
     weights: np.ndarray | None = None,
 ) -> Iterator[GuidedIterate]:
     """
-    Evaluate both policies, improve the guider, then the learner, without end. The guider begins as the learner.
+    Guided policy iteration without end: each iteration evaluates both policies, improves the guider, and then improves the
+    learner. The first guider equals the first learner.
 
-    :param pomdp: with S states, O observations and A actions
+    :param pomdp: decision process with S states, O observations and A actions
     :param alpha: weight of the KL, above 0
-    :param learner: the first one, shape (O, A); uniform by default. Actions that it never takes are never learned
-    :param step: the learner's: "distillation" (eq. 8), or "own critic" (eq. 16 with the learner's own values)
-    :param weights: of states in the learner's step, shape (S,); by default the new guider's discounted visits, with which
-        eq. 4 can't fall
-    :return: the first policies, and those after each iteration
-    :raises ValueError: if ``alpha`` is not above 0, or there is no such ``step``
+    :param learner: probabilities of the first learner, shape (O, A); ``None`` for a uniform learner. Actions that the first
+        learner never takes are never learned
+    :param step: the learner's step: "distillation" (eq. 8), or "own critic" (eq. 16 with the learner's own values)
+    :param weights: weights of states in the learner's step, shape (S,); ``None`` for the new guider's discounted visits, with
+        which eq. 4 can't fall
+    :return: iterator over the first policies and those after each iteration
+    :raises ValueError: if ``alpha`` is not above 0, or ``step`` is unknown
     """
     if not alpha > 0:
         raise ValueError(f"alpha must be above 0, got {alpha!r}.")

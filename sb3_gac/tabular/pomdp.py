@@ -1,5 +1,5 @@
 """
-Decision processes with finitely many states, of which a learner sees an observation and a guider sees all.
+Decision processes with finitely many states: a guider sees the state, and a learner sees an observation of the state.
 
 =============  ============================================================  ===========
 symbol         meaning                                                       shape
@@ -20,14 +20,16 @@ import numpy as np
 @dataclass(frozen=True)
 class TabularPOMDP:
     """
-    A process whose states are seen through a function that may give several of them the same observation.
+    A decision process with an observation function, which may give several states the same observation.
 
-    :param transitions: probabilities of the next state, shape (S, A, S); what a row lacks to one ends the episode
-    :param rewards: expected rewards, shape (S, A)
-    :param observations: index of what the learner sees in each state, shape (S,); indices count from 0, and each occurs
+    :param transitions: probabilities of the next state, shape (S, A, S); the episode ends with the probability that a row
+        lacks to one
+    :param rewards: expected reward of each state and action, shape (S, A)
+    :param observations: index of the learner's observation in each state, shape (S,); indices count from 0, and none is left
+        out
     :param start: probabilities of the first state, shape (S,)
-    :param gamma: discount, from 0 to 1
-    :raises ValueError: naming the argument that is no such thing
+    :param gamma: discount factor, from 0 to 1
+    :raises ValueError: if an argument is none of this; the message names the argument
     """
 
     transitions: np.ndarray
@@ -56,18 +58,19 @@ class TabularPOMDP:
 
     def by_state(self, learner: np.ndarray) -> np.ndarray:
         """
-        :param learner: shape (O, A)
-        :return: what it does in each state, shape (S, A)
+        :param learner: the learner's probabilities of actions by observation, shape (O, A)
+        :return: the learner's probabilities of actions by state, shape (S, A)
         """
         return learner[self.observations]
 
     def by_observation(self, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """
-        Average over the states that look the same.
+        The averages over the states that look the same.
 
-        :param values: shape (S, A)
-        :param weights: of states, not negative, shape (S,); states of an observation whose weights are all zero count alike
-        :return: shape (O, A)
+        :param values: values of states and actions, shape (S, A)
+        :param weights: weights of states, not negative, shape (S,); if all states of an observation have weight 0, their
+            average is unweighted
+        :return: averages by observation, shape (O, A)
         """
         same = np.arange(self.shape[2])[:, None] == self.observations
         weight = same * weights
@@ -92,32 +95,32 @@ def _solve(pomdp: TabularPOMDP, policy: np.ndarray, right: np.ndarray, transpose
 
 def state_values(pomdp: TabularPOMDP, policy: np.ndarray, rewards: np.ndarray) -> np.ndarray:
     """
-    :param pomdp: with S states
-    :param policy: by state, shape (S, A)
-    :param rewards: of each state under this policy, shape (S,)
-    :return: expected discounted sums of rewards, shape (S,)
-    :raises ValueError: with ``gamma=1``, if the policy never ends an episode
+    :param pomdp: decision process with S states
+    :param policy: probabilities of actions by state, shape (S, A)
+    :param rewards: expected reward of each state under this policy, shape (S,)
+    :return: expected discounted sum of rewards from each state on, shape (S,)
+    :raises ValueError: if ``gamma`` is 1 and the policy has states from which no episode ends
     """
     return _solve(pomdp, policy, rewards)
 
 
 def action_values(pomdp: TabularPOMDP, policy: np.ndarray) -> np.ndarray:
     """
-    Values of a policy by itself, without guidance: what eq. 15 is a regression to.
+    The values of a policy without guidance, which the regression of eq. 15 aims at.
 
-    :param pomdp: with S states
-    :param policy: by state, shape (S, A)
-    :return: Q, shape (S, A)
+    :param pomdp: decision process with S states
+    :param policy: probabilities of actions by state, shape (S, A)
+    :return: Q of states and actions, shape (S, A)
     """
     return pomdp.rewards + pomdp.gamma * pomdp.transitions @ state_values(pomdp, policy, (policy * pomdp.rewards).sum(axis=1))
 
 
 def expected_return(pomdp: TabularPOMDP, policy: np.ndarray) -> float:
     """
-    Eq. 1, discounted.
+    The return of eq. 1, discounted.
 
-    :param pomdp: with S states
-    :param policy: by state, shape (S, A); ``pomdp.by_state(learner)`` for a learner
+    :param pomdp: decision process with S states
+    :param policy: probabilities of actions by state, shape (S, A); ``pomdp.by_state(learner)`` for a learner
     :return: expected discounted return from the start distribution
     """
     return float(pomdp.start @ (policy * action_values(pomdp, policy)).sum(axis=1))
@@ -125,8 +128,8 @@ def expected_return(pomdp: TabularPOMDP, policy: np.ndarray) -> float:
 
 def visits(pomdp: TabularPOMDP, policy: np.ndarray) -> np.ndarray:
     """
-    :param pomdp: with S states
-    :param policy: by state, shape (S, A)
+    :param pomdp: decision process with S states
+    :param policy: probabilities of actions by state, shape (S, A)
     :return: expected discounted number of steps in each state, shape (S,)
     """
     return np.maximum(_solve(pomdp, policy, pomdp.start, transposed=True), 0.0)
@@ -134,13 +137,13 @@ def visits(pomdp: TabularPOMDP, policy: np.ndarray) -> np.ndarray:
 
 def tiger_door() -> TabularPOMDP:
     """
-    Appendix B: a tiger is behind one of two doors, and only the guider knows behind which.
+    TigerDoor of appendix B: a tiger is behind one of two doors, and only the guider knows behind which.
 
-    States are (left, right) before listening and (left, right) after it; observations are nothing, left and right. Actions
-    open the left door, open the right door, or listen, with the rewards of the paper's Table 1. An open door ends the
-    episode; there is no discount.
+    The states are left and right before listening, and left and right after listening; the observations are nothing, left and
+    right. The actions open the left door, open the right door, or listen, with the rewards of the paper's Table 1. An open
+    door ends the episode; there is no discount.
 
-    :return: with S = 4, A = 3, O = 3
+    :return: decision process with S = 4, A = 3 and O = 3
     """
     transitions = np.zeros((4, 3, 4))
     transitions[[0, 1, 2, 3], 2, [2, 3, 2, 3]] = 1.0

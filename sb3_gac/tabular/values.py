@@ -1,4 +1,4 @@
-"""Guided policy evaluation: eqs. 4 to 6, and eqs. 18 and 19 as they are meant."""
+"""Guided policy evaluation: eqs. 4 to 6, and corrected forms of eqs. 18 and 19."""
 
 import numpy as np
 
@@ -7,9 +7,11 @@ from sb3_gac.tabular.pomdp import TabularPOMDP, state_values
 
 def divergence(guider: np.ndarray, learner: np.ndarray) -> np.ndarray:
     """
-    :param guider: probabilities of actions, shape (S, A)
-    :param learner: the same of the learner, by state, shape (S, A)
-    :return: KL(guider || learner), shape (S,); infinite where the guider does what the learner never does
+    The KL from guider to learner in each state.
+
+    :param guider: the guider's probabilities of actions by state, shape (S, A)
+    :param learner: the learner's probabilities of actions by state, shape (S, A)
+    :return: KL(guider || learner) in nats, shape (S,); infinite where the guider takes an action that the learner never takes
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.where(guider > 0, guider * (np.log(guider) - np.log(learner)), 0.0)
@@ -20,14 +22,14 @@ def guided_backup(
     pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner: np.ndarray, values: np.ndarray
 ) -> np.ndarray:
     """
-    Eqs. 5 and 6: the Bellman operator of a pair of policies, applied once.
+    One application of the guided Bellman operator of a pair of policies, eqs. 5 and 6.
 
-    :param pomdp: with S states, O observations and A actions
+    :param pomdp: decision process with S states, O observations and A actions
     :param alpha: weight of the KL
-    :param guider: shape (S, A)
-    :param learner: shape (O, A)
-    :param values: Q, shape (S, A)
-    :return: the next Q, shape (S, A)
+    :param guider: the guider's probabilities of actions by state, shape (S, A)
+    :param learner: the learner's probabilities of actions by observation, shape (O, A)
+    :param values: Q of states and actions, shape (S, A)
+    :return: next Q of states and actions, shape (S, A)
     """
     after = (guider * values).sum(axis=1) - alpha * divergence(guider, pomdp.by_state(learner))
     return pomdp.rewards + pomdp.gamma * pomdp.transitions @ after
@@ -37,40 +39,41 @@ def guided_values(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner
     """
     The fixed point of :func:`guided_backup`, by a linear system.
 
-    :param pomdp: with S states, O observations and A actions
+    :param pomdp: decision process with S states, O observations and A actions
     :param alpha: weight of the KL
-    :param guider: shape (S, A)
-    :param learner: shape (O, A)
-    :return: Q, shape (S, A)
+    :param guider: the guider's probabilities of actions by state, shape (S, A)
+    :param learner: the learner's probabilities of actions by observation, shape (O, A)
+    :return: guided Q of states and actions, shape (S, A)
     """
     return pomdp.rewards + pomdp.gamma * pomdp.transitions @ _guided_state_values(pomdp, alpha, guider, learner)
 
 
 def guided_objective(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner: np.ndarray) -> float:
     """
-    Eq. 4, discounted: the guider's return less alpha times the KL on its way.
+    The objective of eq. 4, discounted: the guider's return less alpha times the sum of the KL over its steps.
 
-    :param pomdp: with S states, O observations and A actions
+    :param pomdp: decision process with S states, O observations and A actions
     :param alpha: weight of the KL
-    :param guider: shape (S, A)
-    :param learner: shape (O, A)
-    :return: expected from the start distribution
+    :param guider: the guider's probabilities of actions by state, shape (S, A)
+    :param learner: the learner's probabilities of actions by observation, shape (O, A)
+    :return: expected value from the start distribution
     """
     return float(pomdp.start @ _guided_state_values(pomdp, alpha, guider, learner))
 
 
 def augmented_rewards(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner: np.ndarray) -> np.ndarray:
     """
-    Eq. 18 as it is meant: rewards with which guided values are a policy's ordinary ones, under the guider (eq. 19).
+    The corrected rewards of eq. 18, with which the guided values are the ordinary values of the guider (eq. 19).
 
-    The paper adds the KL, which is subtracted, and takes that of the present state, which eq. 5 does not have: with it, the
-    fixed point is that of eq. 5 less alpha KL of the state. Eq. 19's next action is the guider's, not the learner's.
+    The paper adds the KL, where it must be subtracted. The paper also takes the KL of the present state instead of the next
+    state's; the fixed point would then be that of eq. 5 less alpha times the KL of the state. In eq. 19 the next action must
+    be the guider's, not the learner's.
 
-    :param pomdp: with S states, O observations and A actions
+    :param pomdp: decision process with S states, O observations and A actions
     :param alpha: weight of the KL
-    :param guider: shape (S, A)
-    :param learner: shape (O, A)
-    :return: r - alpha gamma E[KL in the next state], shape (S, A)
+    :param guider: the guider's probabilities of actions by state, shape (S, A)
+    :param learner: the learner's probabilities of actions by observation, shape (O, A)
+    :return: corrected rewards r - alpha gamma E[KL in the next state], shape (S, A)
     """
     return pomdp.rewards - alpha * pomdp.gamma * pomdp.transitions @ divergence(guider, pomdp.by_state(learner))
 

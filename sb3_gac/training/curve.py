@@ -11,13 +11,14 @@ def draw_learning_curve(
     history: Sequence[Mapping[str, float]], title: str, path: Path, random: float | None = None, warm_up: float = 0
 ) -> None:
     """
-    Returns of the policies over environment steps and, where there is a guider, KL beside its target.
+    Draw the policies' returns over environment steps and, where the evaluations have it, the KL with its target.
 
-    :param history: of :class:`sb3_gac.GuiderLearnerEvalCallback` or :class:`sb3_gac.SeededEvalCallback`
-    :param title: of the figure
-    :param path: of the picture
-    :param random: return of random actions, to be marked; ``None`` if it is not known
-    :param warm_up: environment steps of random actions at the start, to be marked
+    :param history: evaluations, the ``history`` of a :class:`sb3_gac.GuiderLearnerEvalCallback` or
+        :class:`sb3_gac.SeededEvalCallback`
+    :param title: title of the figure
+    :param path: path of the picture
+    :param random: mean return of random actions, drawn as a line; ``None`` for no line
+    :param warm_up: number of environment steps with random actions at the start, drawn as a shaded area
     """
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt

@@ -1,4 +1,4 @@
-"""The directory of a run: its configuration, from which it can be taken up again, its checkpoints and its results."""
+"""The directory of a run: its configuration, from which the run can be resumed, its checkpoints and its results."""
 
 import json
 import os
@@ -32,9 +32,11 @@ _PATHS = ("runs", "teacher")
 
 def options_of(directory: Path) -> Namespace:
     """
-    :param directory: of a run that was stopped
-    :return: its options, to go on with it
-    :raises ValueError: if there is nothing to go on with
+    Read the options of a run that is to be resumed.
+
+    :param directory: directory of a run that was stopped
+    :return: options of the run, with the directory as ``resume``
+    :raises ValueError: if the run is finished, or the directory is none of a run
     """
     if (directory / RESULTS).exists():
         raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
@@ -44,7 +46,7 @@ def options_of(directory: Path) -> Namespace:
     given = {name: value for name, value in configuration.items() if name in _OPTIONS and value is not None}
     given = {name: value for name, value in given.items() if value != DEFAULTS.get(name)}
     given |= {name: Path(given[name]) for name in _PATHS if name in given}
-    given.setdefault("history", 1)  # which runs of earlier versions had
+    given.setdefault("history", 1)  # runs of earlier versions had no history
     if "env" in given:
         given.pop("task", None)
     return Namespace(**vars(resolve(given)) | {"resume": directory})
@@ -52,8 +54,8 @@ def options_of(directory: Path) -> Namespace:
 
 def new_directory(options: Namespace) -> Path:
     """
-    :param options: see :func:`resolve`
-    :return: path of a directory that there is not yet
+    :param options: options of the run, see :func:`resolve`
+    :return: path of a directory that does not exist yet
     """
     path: Path = options.runs / f"{name_of_run(options)}-{time.strftime('%Y%m%d-%H%M%S')}"
     others = (path.with_name(f"{path.name}-{number}") for number in range(2, 10_000))
@@ -62,11 +64,11 @@ def new_directory(options: Namespace) -> Path:
 
 def write_configuration(directory: Path, options: Namespace, model: Any) -> None:
     """
-    All that it takes to repeat the run.
+    Write down all that it takes to repeat a run: options, arguments, seeds, versions and commit.
 
-    :param directory: of the run
-    :param options: see :func:`resolve`
-    :param model: that it trains, with all arguments
+    :param directory: directory of the run, which is made if it does not exist
+    :param options: options of the run, see :func:`resolve`
+    :param model: model that the run trains
     """
     suite = suite_of(options.env_id)
     simulators = ["gymnasium-robotics", *filter(None, [SUITES[suite].extra] if suite else [])]
@@ -87,13 +89,13 @@ def write_configuration(directory: Path, options: Namespace, model: Any) -> None
 
 
 def _own_kwargs(options: Namespace) -> dict[str, Any]:
-    """Of the environment: those that are no options of their own."""
+    """The environment's keyword arguments that are no options of the main job."""
     own = () if options.task is None else ("noise_std", "privileged", "history")
     return {name: value for name, value in options.env_kwargs.items() if name not in own}
 
 
 def _plain(value: Any) -> Any:
-    """What YAML has a form for; all else as text."""
+    """The value in the types of YAML; other types as text."""
     if isinstance(value, Mapping):
         return {str(key): _plain(part) for key, part in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
@@ -107,8 +109,10 @@ def _plain(value: Any) -> Any:
 
 def write_at_once(path: Path, text: str) -> None:
     """
-    :param path: which has the whole text or is what it was before, whenever the process ends
-    :param text: to write
+    Write a file in one piece: if the process ends meanwhile, the file has either its old or its new content.
+
+    :param path: path of the file
+    :param text: new content of the file
     """
     temporary = path.with_name(f"{path.name}.tmp")
     temporary.write_text(text)
@@ -117,9 +121,11 @@ def write_at_once(path: Path, text: str) -> None:
 
 def how_to_go_on(directory: Path, steps: int) -> str:
     """
-    :param directory: of a run that was stopped
-    :param steps: that it is to have in the end
-    :return: how far it is, and what to do, in one line
+    The message for a run that was stopped.
+
+    :param directory: directory of the run
+    :param steps: number of environment steps of the whole run
+    :return: number of saved steps and the command that resumes the run, in one line
     """
     if (directory / RESULTS).exists():
         return f"The run is finished; its results are in {directory}."
@@ -130,9 +136,11 @@ def how_to_go_on(directory: Path, steps: int) -> str:
 
 def summary(directory: Path, options: Namespace) -> str:
     """
-    :param directory: of a finished run
-    :param options: see :func:`resolve`
-    :return: what came out, and how to use it
+    The message at the end of a run.
+
+    :param directory: directory of the finished run
+    :param options: options of the run, see :func:`resolve`
+    :return: text with the results, and how to use the learner
     """
     results = json.loads((directory / RESULTS).read_text())
     name = algorithm_class(options.algorithm).__name__
@@ -155,8 +163,8 @@ Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. 
 
 def in_words(options: Namespace) -> str:
     """
-    :param options: see :func:`resolve`
-    :return: the environment, with its noise and its history if it has them
+    :param options: options of the run, see :func:`resolve`
+    :return: text with the environment's id, and its noise and history if it has them
     """
     noise = "" if options.noise is None else f"noise {options.noise:g}"
     history = "" if options.history == 1 else f"history {options.history}"
@@ -166,7 +174,7 @@ def in_words(options: Namespace) -> str:
 
 def shown(value: float) -> str:
     """
-    :param value: such as a return
-    :return: in three digits, or as many as its integer part has
+    :param value: a number, such as a return
+    :return: the number as text, rounded to an integer from 100 on, else to three significant digits
     """
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""Environments by name: one of this package's, any of gymnasium's, or what a module has, with arguments and wrappers."""
+"""Environments by name, with arguments and wrappers: this package's, any of gymnasium's, or a module's own."""
 
 import os
 import sys
@@ -17,7 +17,7 @@ from sb3_gac.algorithms import import_path
 from sb3_gac.envs import PARTIAL, History, make_vec
 from sb3_gac.envs.suites import suite_of
 
-#: File of ``VecNormalize``'s statistics beside a model, as rl_zoo3 calls it
+#: Name of the file of ``VecNormalize``'s statistics beside a model, the same as in rl_zoo3
 STATISTICS = "vecnormalize.pkl"
 
 
@@ -29,25 +29,31 @@ def make_envs(
     seed: int | None = None,
 ) -> VecEnv:
     """
-    :param env_id: of this package's, or see :func:`make_wrapped`
-    :param kwargs: of the environment
-    :param wrappers: see :func:`make_wrapped`
-    :param n_envs: side by side
-    :param seed: of the first one
+    Make vectorised environments.
+
+    :param env_id: id of one of this package's environments, or a name that :func:`make_wrapped` describes
+    :param kwargs: keyword arguments of the environment
+    :param wrappers: wrappers from the inside to the outside, each a mapping from ``module:Class`` to its keyword arguments
+    :param n_envs: number of environments
+    :param seed: seed of the first environment; ``None`` for a random one
+    :return: vectorised environments
     :raises ValueError: if a wrapper can't be imported
     """
     if suite_of(env_id) is not None and not wrappers:
         return make_vec(env_id, n_envs, seed, **kwargs)
-    # What counts returns goes around the wrappers: one of them may change rewards, or end episodes
+    # The monitor of returns goes outside of the wrappers, since a wrapper may change rewards or end episodes
     return make_vec_env(partial(make_wrapped, env_id, kwargs, wrappers), n_envs, seed=seed)
 
 
 def make_wrapped(env_id: str, kwargs: Mapping[str, Any], wrappers: Sequence[Mapping[str, Mapping[str, Any]]]) -> gym.Env:
     """
-    :param env_id: of gymnasium, after the module that registers it and a colon if need be; or ``module:name`` of a class or
-        function that makes an environment
-    :param kwargs: of the environment
-    :param wrappers: from the inside to the outside, each ``module:Class`` and its keyword arguments
+    Make one environment with its wrappers.
+
+    :param env_id: id in gymnasium, after the name of the module that registers the environment and a colon if necessary; or
+        ``module:name`` of a class or function that makes an environment
+    :param kwargs: keyword arguments of the environment
+    :param wrappers: wrappers from the inside to the outside, each a mapping from ``module:Class`` to its keyword arguments
+    :return: wrapped environment
     :raises ValueError: if a wrapper can't be imported
     """
     return in_wrappers(_make(env_id, kwargs), wrappers)
@@ -55,8 +61,11 @@ def make_wrapped(env_id: str, kwargs: Mapping[str, Any], wrappers: Sequence[Mapp
 
 def in_wrappers(env: gym.Env, wrappers: Sequence[Mapping[str, Mapping[str, Any]]]) -> gym.Env:
     """
-    :param env: to be wrapped
-    :param wrappers: see :func:`make_wrapped`
+    Wrap an environment.
+
+    :param env: environment to wrap
+    :param wrappers: wrappers from the inside to the outside, each a mapping from ``module:Class`` to its keyword arguments
+    :return: wrapped environment
     :raises ValueError: if a wrapper can't be imported
     """
     for wrapper in wrappers:
@@ -75,8 +84,11 @@ def _make(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env:
 
 def with_history(env: gym.Env, length: int) -> gym.Env:
     """
-    :param env: with a Dict observation
-    :param length: observations that ``partial`` then has, with the actions between them where it and they are vectors
+    Give the learner the last observations, and the actions between them where both are vectors.
+
+    :param env: environment with a Dict observation
+    :param length: number of observations in ``partial``, the newest included
+    :return: environment in a :class:`sb3_gac.envs.History`
     """
     assert isinstance(env.observation_space, spaces.Dict)
     entry = env.observation_space[PARTIAL]
@@ -86,14 +98,18 @@ def with_history(env: gym.Env, length: int) -> gym.Env:
 
 def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = True) -> VecEnv:
     """
+    Normalise observations.
+
     :param env: vectorised environments
-    :param options: of ``VecNormalize``, which leaves rewards alone; ``None`` for no normalisation
-    :param training: whether it gathers statistics
+    :param options: keyword arguments of ``VecNormalize``, which does not normalise rewards unless they say so; ``None`` for no
+        normalisation
+    :param training: whether ``VecNormalize`` updates its statistics
+    :return: environments in a ``VecNormalize``, or as they were
     """
     return env if options is None else VecNormalize(env, **{"norm_reward": False, "training": training, **options})
 
 
 def find_modules_here() -> None:
-    """A console script finds no modules in the working directory, where ``python -m`` does."""
+    """Let imports find modules in the working directory, as ``python -m`` does and a console script does not."""
     if not {"", os.getcwd()} & set(sys.path):
         sys.path.insert(0, os.getcwd())

@@ -1,4 +1,4 @@
-"""The two policies that a finished run is judged by: the learner as it is deployed, and actions at random."""
+"""Evaluation of a finished run: the learner as it is deployed, beside random actions."""
 
 from typing import Any
 
@@ -13,25 +13,25 @@ EVAL_SEED = 10_000
 
 class PartialOnly:
     """
-    A model that is handed the partial entry and nothing else, as on the robot.
+    A policy that gives a model the partial entry alone, as on the robot.
 
-    :param model: with ``predict``
+    :param model: model with a method ``predict``
     """
 
     def __init__(self, model: Any):
         self._model = model
 
     def predict(self, observation: dict[str, np.ndarray], *args: Any, **kwargs: Any) -> Any:
-        """Arguments and result of the model's ``predict``."""
+        """The model's actions on the partial entry, with the arguments and result of the model's ``predict``."""
         return self._model.predict({PARTIAL: observation[PARTIAL]}, *args, **kwargs)
 
 
 class UniformActions:
     """
-    Random actions, the yardstick for a short run.
+    A policy that takes random actions, as a reference for the returns of short runs.
 
-    :param env: whose actions to sample
-    :param seed: of the actions
+    :param env: vectorised environments whose action space is sampled
+    :param seed: seed of the actions
     """
 
     def __init__(self, env: VecEnv, seed: int = 0):
@@ -39,16 +39,18 @@ class UniformActions:
         self._space.seed(seed)
 
     def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> Any:
-        """Arguments and result of a model's ``predict``."""
+        """Random actions, with the arguments and result of a model's ``predict``."""
         return np.stack([self._space.sample() for _ in range(self._n_envs)]), state
 
 
 def evaluate(policy: Any, env: VecEnv, episodes: int) -> tuple[float, float]:
     """
-    :param policy: with ``predict``
-    :param env: evaluated from ``EVAL_SEED``
+    Evaluate a policy on episodes that start from the seed ``EVAL_SEED``.
+
+    :param policy: model or policy with a method ``predict``
+    :param env: vectorised environments to evaluate in
     :param episodes: number of episodes
-    :return: mean and standard deviation of the return
+    :return: mean and standard deviation of the episodes' returns
     """
     env.seed(EVAL_SEED)
     mean, std = evaluate_policy(policy, env, n_eval_episodes=episodes)

@@ -1,4 +1,4 @@
-"""The main job: train, evaluate the learner on its partial observation alone, and leave behind what came out."""
+"""The main job: train a model, evaluate the learner on its partial observation alone, and save the results."""
 
 import json
 import shutil
@@ -34,18 +34,18 @@ from sb3_gac.training.options import algorithm_arguments
 from sb3_gac.training.progress import Progress
 
 EVALUATIONS = 10
-#: Episodes of an evaluation on the way, side by side: enough for a curve
+#: Number of episodes of an evaluation during training, all at the same time: enough for a curve
 EPISODES_ON_THE_WAY = 5
 
 
 class Job(NamedTuple):
     """
-    What is ready to be trained.
+    A run that is ready to train.
 
-    :param options: see :func:`sb3_gac.training.options.resolve`
-    :param directory: where everything is saved
-    :param model: new, or as its last checkpoint has it
-    :param eval_env: to evaluate in
+    :param options: options of the run, see :func:`sb3_gac.training.options.resolve`
+    :param directory: directory that everything is saved in
+    :param model: model to train, new or from its last checkpoint
+    :param eval_env: vectorised environments to evaluate in
     """
 
     options: Namespace
@@ -56,10 +56,11 @@ class Job(NamedTuple):
 
 def prepare(options: Namespace) -> Job:
     """
-    Make environments and model, and a directory with the configuration.
+    Make the environments and the model, and a directory with the configuration.
 
-    :param options: see :func:`sb3_gac.training.options.resolve`
-    :raises ValueError: if the environment, or an argument, is wrong; then nothing was written
+    :param options: options of the run, see :func:`sb3_gac.training.options.resolve`
+    :return: run that is ready to train
+    :raises ValueError: if the environment or an argument is wrong; then nothing was written
     """
     set_random_seed(options.seed)
     env, eval_env = open_environments(options)
@@ -78,7 +79,9 @@ def prepare(options: Namespace) -> Job:
 
 def run(job: Job) -> None:
     """
-    :param job: to be done, or what is left of it
+    Train to the end, evaluate, and save the results.
+
+    :param job: run that is ready to train, new or resumed
     """
     history, minutes = learn(job)
     finish(job, history, minutes)
@@ -86,9 +89,11 @@ def run(job: Job) -> None:
 
 def open_environments(options: Namespace) -> tuple[VecEnv, VecEnv]:
     """
-    :param options: see :func:`sb3_gac.training.options.resolve`
-    :return: those to train in, and those to evaluate in
-    :raises ValueError: if there is no such environment, saying what was looked for
+    Make the environments of a run.
+
+    :param options: options of the run, see :func:`sb3_gac.training.options.resolve`
+    :return: vectorised environments to train in, and to evaluate in
+    :raises ValueError: if an environment or wrapper can't be made; the message names the environment
     """
     find_modules_here()
     made = (options.env_id, options.env_kwargs, options.wrappers)
@@ -114,10 +119,10 @@ def _resumed(options: Namespace, directory: Path, env: VecEnv) -> Any:
 
 def learn(job: Job) -> tuple[list[dict[str, float]], float]:
     """
-    Train to the end. There is a checkpoint of the start, of every evaluation and of the end, and one when Ctrl-C is pressed.
+    Train to the end. Checkpoints are written at the start, at every evaluation, at the end, and when Ctrl-C is pressed.
 
-    :param job: to be done
-    :return: the evaluations, and the minutes that it took, those of a process that was stopped included
+    :param job: run that is ready to train
+    :return: results of the evaluations, and duration of training in minutes, earlier processes of the same run included
     """
     options, directory, model, eval_env = job
     every = max(options.steps // EVALUATIONS // options.envs, 1)
@@ -149,7 +154,7 @@ def _evaluation_class(model: Any) -> type[SeededEvalCallback]:
 
 
 def _save_checkpoint(model: Any, root: Path, notes: dict[str, Any]) -> None:
-    """Of the end: what is left, to evaluate and to write results, can be stopped as well."""
+    """Write the checkpoint of the end of training, since the evaluation that follows can be stopped as well."""
     try:
         model.save_checkpoint(root, notes=notes)
     except OSError as error:
@@ -158,11 +163,11 @@ def _save_checkpoint(model: Any, root: Path, notes: dict[str, Any]) -> None:
 
 def finish(job: Job, history: list[dict[str, float]], minutes: float) -> None:
     """
-    Save the model, evaluate it, and write down what came out; then there is nothing left to go on with.
+    Save the model, evaluate it, write the results, and delete the checkpoints; then the run can't be resumed any more.
 
-    :param job: whose model is trained
-    :param history: its evaluations
-    :param minutes: that training took
+    :param job: run whose model is trained
+    :param history: results of the evaluations during training
+    :param minutes: duration of training, in minutes
     """
     options, directory, model, eval_env = job
     model.save(directory / MODEL)

@@ -1,4 +1,4 @@
-"""Options of the main job: what the command line takes, and what becomes of what it leaves out."""
+"""Options of the main job: the parser of the command line, and the values of options that it leaves out."""
 
 import argparse
 import re
@@ -14,9 +14,9 @@ from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.envs.suites import SUITES, Suite, env_id_of, suite_of, task_of
 from sb3_gac.presets import PRESETS, merge, preset
 
-#: Noisy observations that the learner sees: with four it returned 3766 on HalfCheetah after 50,000 steps, with one 3432
+#: Number of noisy observations that the learner sees: on HalfCheetah, 50,000 steps, it returned 3766 with four, 3432 with one
 HISTORY = 4
-#: What options are that are not given and do not depend on others
+#: Default values of the options that do not depend on others
 DEFAULTS: Mapping[str, Any] = {
     "task": "HalfCheetah",
     "env_kwargs": {},
@@ -31,17 +31,17 @@ DEFAULTS: Mapping[str, Any] = {
     "tensorboard": False,
     "runs": Path("runs"),
 }
-#: Argument of the algorithms that learn from one
+#: Name of the argument by which algorithms take a teacher
 TEACHER = "teacher"
 _COMPILE = {"auto": "auto", "yes": True, "no": False}
-#: Arguments of this package's environments that are options of their own
+#: Argument of this package's environments -> option of the main job
 _OF_TASKS = {"noise_std": "noise", "privileged": "privileged", "history": "history"}
 
 
 def make_parser(description: str | None = None) -> argparse.ArgumentParser:
     """
-    :param description: of the program
-    :return: parser of the command line; what is not given is ``None``
+    :param description: description of the program, for its help
+    :return: parser of the command line, which sets options that are not given to ``None``
     """
     parser = argparse.ArgumentParser(
         prog="python -m sb3_gac.train", description=description, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -135,8 +135,9 @@ def _add_results(group: Any) -> None:
 
 def positive(text: str) -> int:
     """
-    :param text: of the command line
-    :raises argparse.ArgumentTypeError: unless it is an integer of 1 or more
+    :param text: value on the command line
+    :return: number that it stands for
+    :raises argparse.ArgumentTypeError: if it is no integer, or below 1
     """
     try:
         value = int(text)
@@ -149,8 +150,9 @@ def positive(text: str) -> int:
 
 def from_yaml(text: str) -> Any:
     """
-    :param text: of the command line
-    :raises argparse.ArgumentTypeError: unless it is YAML
+    :param text: value on the command line
+    :return: content of the YAML
+    :raises argparse.ArgumentTypeError: if the text is no YAML
     """
     try:
         return yaml.safe_load(text)
@@ -160,8 +162,9 @@ def from_yaml(text: str) -> Any:
 
 def mapping(text: str) -> dict[str, Any]:
     """
-    :param text: of the command line
-    :raises argparse.ArgumentTypeError: unless it is a mapping in YAML
+    :param text: value on the command line
+    :return: mapping that it stands for
+    :raises argparse.ArgumentTypeError: if the text is no mapping in YAML
     """
     found = from_yaml(text)
     if not isinstance(found, Mapping):
@@ -171,9 +174,9 @@ def mapping(text: str) -> dict[str, Any]:
 
 def given_options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> dict[str, Any]:
     """
-    :param parser: of :func:`make_parser`
-    :param arguments: command line, by default the process's
-    :return: what was given
+    :param parser: parser from :func:`make_parser`
+    :param arguments: words of the command line; ``None`` for those of the process
+    :return: name -> value, for the options that were given
     """
     given = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
     return given | ({"compile": _COMPILE[given["compile"]]} if "compile" in given else {})
@@ -181,9 +184,11 @@ def given_options(parser: argparse.ArgumentParser, arguments: Sequence[str] | No
 
 def resolve(given: Mapping[str, Any]) -> Namespace:
     """
-    :param given: options, by name
-    :return: all options; with ``env_id``, and in ``env_kwargs`` and ``wrappers`` all that the environment is made with
-    :raises ValueError: naming an option that does not go with others
+    Complete and check the options.
+
+    :param given: name -> value, for the options that were given
+    :return: all options, with ``env_id``, ``env_kwargs`` and ``wrappers``, from which the environment is made
+    :raises ValueError: if an option does not go with the others; the message names the option
     """
     if "task" in given and "env" in given:
         raise ValueError("--task and --env: give one of them.")
@@ -219,7 +224,7 @@ def _resolve_task(options: Namespace, given: Mapping[str, Any], suite: Suite) ->
     options.wrappers = []
     options.env_kwargs = {
         **({"noise_std": options.noise} if suite.sensor_noise else {}),
-        **({"privileged": options.privileged} if options.privileged != "state" else {}),  # which not every suite can change
+        **({"privileged": options.privileged} if options.privileged != "state" else {}),  # not every suite has the argument
         **({"history": options.history} if options.history != 1 else {}),
         **options.env_kwargs,
     }
@@ -258,8 +263,8 @@ def _check_teacher(options: Namespace) -> None:
 
 def algorithm_arguments(options: Namespace) -> dict[str, Any]:
     """
-    :param options: see :func:`resolve`
-    :return: the preset's keyword arguments of the algorithm for this task and noise, and what the command line says on top
+    :param options: options of the run, see :func:`resolve`
+    :return: keyword arguments of the algorithm: the preset's for the task and its noise, below those of the command line
     """
     kind: Any = algorithm_class(options.algorithm)
     own: dict[str, Any] = {"compile": options.compile}
@@ -276,8 +281,8 @@ def algorithm_arguments(options: Namespace) -> dict[str, Any]:
 
 def name_of_run(options: Namespace) -> str:
     """
-    :param options: see :func:`resolve`
-    :return: of its directory, without the time
+    :param options: options of the run, see :func:`resolve`
+    :return: name of the run's directory, without the time
     """
     environment = options.task or re.sub(r"[^\w.+-]", "-", re.split("[:/]", options.env_id)[-1])
     parts = [

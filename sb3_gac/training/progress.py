@@ -1,4 +1,4 @@
-"""How a run is going: a bar with returns, KL and time left on a terminal, elsewhere a line for each evaluation."""
+"""Progress of a run: on a terminal a bar with returns, KL and time left, elsewhere a line for each evaluation."""
 
 import shutil
 import sys
@@ -15,16 +15,16 @@ from sb3_gac import SeededEvalCallback
 from sb3_gac.training.directory import shown
 
 _BAR = "{percentage:3.0f}% {bar} {n:,}/{total:,}{desc}"
-#: Columns from which there is room for names, and not only for numbers
+#: Number of columns from which the terminal has room for long texts
 _WIDE = 100
 
 
 class Progress(BaseCallback):
     """
-    To be called after the evaluations.
+    A callback that shows the progress of a run; it comes after the callback that evaluates.
 
-    :param evaluation: whose ``history`` is shown
-    :param total: environment steps of the whole run
+    :param evaluation: callback whose ``history`` is shown
+    :param total: number of environment steps of the whole run
     """
 
     def __init__(self, evaluation: SeededEvalCallback, total: int):
@@ -35,7 +35,7 @@ class Progress(BaseCallback):
         self._evaluations = 0
         self._logged: dict[str, float] = {}
         self._updates_before = 0
-        #: When and after how many steps gradient steps were under way: compiled, and no longer warm-up
+        #: Time in seconds and number of environment steps at which warm-up and compilation were over
         self._under_way: tuple[float, int] | None = None
         self._compiles_now = False
 
@@ -45,7 +45,7 @@ class Progress(BaseCallback):
             print(self.model.compile_decision, flush=True)  # type: ignore[attr-defined]
         if sys.stderr.isatty():
             start: dict[str, Any] = {"total": self._total, "initial": self.num_timesteps}
-            # Not shown before it is whole: until then notes are not written above it, but behind it.
+            # The delay hides the bar until it is complete: tqdm would write notes behind an incomplete bar, not above it
             start["delay"] = 1e-9
             self._bar = tqdm(**start, bar_format=_BAR, dynamic_ncols=True, mininterval=0.2, leave=True)
             self.model.learn_scope.callback(self._bar.close)  # type: ignore[attr-defined]
@@ -82,8 +82,8 @@ class Progress(BaseCallback):
 
     def beside_the_bar(self, columns: int) -> str:
         """
-        :param columns: of the terminal
-        :return: what is known of the run, as far as there is room
+        :param columns: width of the terminal
+        :return: text beside the bar: returns, KL and time left, or what the run does now
         """
         if self._compiles_now:
             return "  compiling: half a minute" if columns < _WIDE else "  compiling gradient steps, about half a minute"
@@ -101,7 +101,7 @@ class Progress(BaseCallback):
         return "".join(f"  {part}" for part in parts)
 
     def line(self) -> str:
-        """What the last evaluation has found."""
+        """A line with the results of the last evaluation and the time left."""
         parts = [f"{name} {shown(value)}" for name, value in self._returns().items()]
         last = self._evaluation.history[-1]
         if "kl" in last:
@@ -118,11 +118,11 @@ class Progress(BaseCallback):
         return {name: last[name] for name in ("learner", "guider") if name in last}
 
     def _kl(self) -> tuple[float | None, float | None]:
-        """KL of the last gradient steps and its target, as far as the algorithm logs them."""
+        """KL of the last gradient steps, and its target; ``None`` for what the algorithm does not log."""
         return self._logged.get("train/kl"), self._logged.get("train/target_kl")
 
     def seconds_left(self) -> float | None:
-        """At the pace since gradient steps are under way; ``None`` before."""
+        """Seconds left at the pace since warm-up and compilation were over; ``None`` before."""
         if self._under_way is None:
             return None
         since, steps_then = self._under_way
@@ -132,8 +132,8 @@ class Progress(BaseCallback):
 
 def clock(seconds: float) -> str:
     """
-    :param seconds: of a duration
-    :return: as in 1:05, or 2:00:30
+    :param seconds: duration in seconds
+    :return: duration as text, such as 1:05 or 2:00:30
     """
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
@@ -142,12 +142,12 @@ def clock(seconds: float) -> str:
 
 @contextmanager
 def warnings_in_a_line() -> Iterator[None]:
-    """Warnings are sentences for whoever trains, above the bar if there is one, and name no line of code."""
+    """Show warnings as one line each, above the bar if there is one, without a line of code."""
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **others: Any) -> None:
         tqdm.write(f"{'Deprecated' if issubclass(category, DeprecationWarning) else 'Note'}: {message}", file=sys.stderr)
 
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Stopped by SIG")  # which names a way to go on in Python
+        warnings.filterwarnings("ignore", message="Stopped by SIG")  # that warning says how to resume in Python
         warnings.showwarning = show
         yield

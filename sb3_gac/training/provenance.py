@@ -1,4 +1,4 @@
-"""What a run was made with: commit, versions, machine."""
+"""Provenance of a run: commit, versions and machine."""
 
 import os
 import platform
@@ -16,9 +16,10 @@ PACKAGES = ("sb3_gac", "stable-baselines3", "torch", "numpy", "gymnasium", "mujo
 
 def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
     """
-    Commit, versions and machine.
+    Commit, versions and machine of this process.
 
-    :param packages: names of further distributions whose versions count; those that are not installed are left out
+    :param packages: names of further distributions whose versions are added; those that are not installed are left out
+    :return: ``commit``, ``versions`` by distribution, and the numbers ``cpus`` and ``threads``
     """
     return {
         "commit": commit(),
@@ -31,17 +32,17 @@ def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
 def commit(package: Path = PACKAGE) -> str:
     """
     :param package: directory of the code
-    :return: the commit that it is from, with "+changes" if it was changed since; "" if it is not under version control
+    :return: hash of the code's commit, with "+changes" if the code was changed since; "" if it is not under version control
     """
     if _git(package, "ls-files", "__init__.py") == "":
-        return ""  # installed somewhere within another repository, if there is one
+        return ""  # not under version control, or installed inside of another repository
     return _git(package, "rev-parse", "HEAD") + ("+changes" if _git(package, "status", "--porcelain", ".") else "")
 
 
 def _git(directory: Path, *words: str) -> str:
     try:
         done = subprocess.run(["git", "-C", str(directory), *words], capture_output=True, text=True, check=False)
-    except OSError:  # there is no git
+    except OSError:  # git is not installed
         return ""
     return done.stdout.strip()
 

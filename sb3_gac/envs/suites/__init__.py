@@ -1,19 +1,19 @@
 """
-The registered environments, suite by suite: one table.
+A table of the registered environments, suite by suite.
 
-A suite is a module with ``ENVIRONMENTS``, from ids to what ``gymnasium.register`` takes.  It imports its simulator when an
-environment is made, and says with :func:`~sb3_gac.envs.suites.extras.import_extra` how to install it.  Beside gymnasium's own
-arguments there may be
+A suite is a module with ``ENVIRONMENTS``, a mapping from ids to the arguments of ``gymnasium.register``.  The module imports
+its simulator when an environment is made, by :func:`~sb3_gac.envs.suites.extras.import_extra`, which says how to install a
+missing one.  Beside gymnasium's own arguments there may be
 
 ``vec_entry_point``
-    in the place of ``entry_point``, where the simulator steps many environments at once: ``module:function``, which takes
-    ``n_envs`` and the ``kwargs``, and returns SB3's ``VecEnv``.  ``gymnasium.make`` makes one environment of it.
+    ``module:function``, in the place of ``entry_point``, where the simulator steps many environments at once.  The function
+    takes ``n_envs`` and the ``kwargs``, and returns SB3's ``VecEnv``.  ``gymnasium.make`` makes one environment of it.
 ``shapes``
-    of the entries and of the actions, ``{"partial": (48,), "privileged": (123,), "action": (12,)}``, so that they are known
-    without the simulator.
+    shapes of the entries and of the actions, such as ``{"partial": (48,), "privileged": (123,), "action": (12,)}``, which are
+    then known without the simulator.
 ``whole_state``
-    whether the privileged entry has all that ``partial`` shows, so that critics need nothing else; by default, what the suite
-    says.
+    whether the privileged entry has all that ``partial`` shows, so that critics need no other entry; by default, the suite's
+    ``sensor_noise``.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,14 +31,14 @@ class Suite(NamedTuple):
     """
     Environments that belong together.
 
-    :param module: has them
-    :param sensor_noise: whether they take ``noise_std``, and, if an environment does not say otherwise, their privileged entry
-        has the whole state
-    :param history: whether they take ``history``, a number of observations that ``partial`` then has
-    :param extra: of this package, with which their simulator is installed; ``None`` where it always is, or no index has it
-    :param simulator: module that it is then found by, by default of the extra's name
-    :param preset: with which ``python -m sb3_gac.train`` trains on them
-    :param noise_std: with which it does, 0 where sensors are noisy without
+    :param module: path of the module that has the environments
+    :param sensor_noise: whether the environments take ``noise_std``; also whether their privileged entry has the whole state,
+        unless an environment says otherwise
+    :param history: whether the environments take ``history``, the number of observations that ``partial`` then has
+    :param extra: extra of this package that installs the simulator; ``None`` if it is always installed, or no index has it
+    :param simulator: name of the module that tells whether the simulator is installed, by default the extra's name
+    :param preset: name of the preset with which ``python -m sb3_gac.train`` trains on the environments
+    :param noise_std: standard deviation of the sensor noise in ``python -m sb3_gac.train`` if none is given
     """
 
     module: str
@@ -57,14 +57,14 @@ class Suite(NamedTuple):
 
     @property
     def is_installed(self) -> bool:
-        """Whether its simulator is there; it is not imported."""
+        """Whether the simulator is installed; it is not imported to find out."""
         module = self.simulator or self.extra
         return module is None or find_spec(module) is not None
 
     def how_to_install(self, user: str) -> str:
         """
-        :param user: what can't be made without the simulator, such as a task
-        :return: a sentence that says what is missing
+        :param user: name of what can't be made without the simulator, such as a task
+        :return: sentence that says what is missing and how to install it
         """
         if self.extra is None:
             return f"{user} needs {self.simulator}, which no package index has: docs/environments.md says how to install it."
@@ -72,14 +72,14 @@ class Suite(NamedTuple):
 
     def shows_whole_state(self, env_id: str) -> bool:
         """
-        :param env_id: of one of its environments
-        :return: whether the privileged entry has all that ``partial`` shows
+        :param env_id: id of one of the suite's environments
+        :return: whether the environment's privileged entry has all that ``partial`` shows
         """
         return bool(self.environments[env_id].get("whole_state", self.sensor_noise))
 
 
 _NAMESPACE = "sb3_gac/"
-#: Arguments of an environment that are this package's, not gymnasium's
+#: Arguments of an environment that are for this package, not for gymnasium
 _OWN = ("vec_entry_point", "shapes", "whole_state")
 _SINGLE = "sb3_gac.envs.vector.single:make_single"
 
@@ -102,7 +102,9 @@ SUITES = {
 
 def register(suite: str) -> None:
     """
-    :param suite: a key of ``SUITES``, whose environments gymnasium is to know
+    Register a suite's environments with gymnasium.
+
+    :param suite: name of the suite, a key of ``SUITES``
     """
     for env_id, arguments in SUITES[suite].environments.items():
         of_gymnasium = {name: value for name, value in arguments.items() if name not in _OWN}
@@ -113,24 +115,28 @@ def register(suite: str) -> None:
 
 def suite_of(env_id: str) -> str | None:
     """
-    :param env_id: of an environment
-    :return: the suite that has it, ``None`` if it is none of this package's
+    Find the suite that has an environment.
+
+    :param env_id: id of an environment
+    :return: name of the suite that has the environment, ``None`` if no suite of this package has it
     """
     return next((name for name, suite in SUITES.items() if env_id in suite.environments), None)
 
 
 def env_id_of(task: str) -> str:
     """
-    :param task: a task's name, or an id, see :func:`task_named`
-    :return: the id of the task's environment
-    :raises ValueError: naming the nearest tasks, if there is none
+    Find the id of a task's environment.
+
+    :param task: name of a task, or id of its environment, in any form that :func:`task_named` takes
+    :return: id of the task's environment
+    :raises ValueError: if there is no such task; the message names the nearest ones
     """
     return registered_tasks()[task_named(task)]
 
 
 def registered_tasks() -> dict[str, str]:
     """
-    :return: task -> id of its environment, of this package's suites and of whatever else is registered as ``sb3_gac/...``
+    :return: task -> id of its environment, for this package's suites and all else that is registered as ``sb3_gac/...``
     """
     of_suites = [env_id for suite in SUITES.values() for env_id in suite.environments]
     others = [env_id for env_id in gym.registry if env_id.startswith(_NAMESPACE)]
@@ -139,10 +145,12 @@ def registered_tasks() -> dict[str, str]:
 
 def task_named(name: str) -> str:
     """
-    :param name: a task's name, or the id of its environment: ``HalfCheetah``, ``HalfCheetah-v5``,
-        ``sb3_gac/HalfCheetah-v5``, or, after a module that registers it, ``sb3_gac:sb3_gac/HalfCheetah-v5``
-    :return: the task's name, ``HalfCheetah``
-    :raises ValueError: naming the nearest tasks, if there is none
+    Find a task by its name or by the id of its environment.
+
+    :param name: name of a task, or id of its environment: ``HalfCheetah``, ``HalfCheetah-v5``, ``sb3_gac/HalfCheetah-v5``, or,
+        after a module that registers the environment, ``sb3_gac:sb3_gac/HalfCheetah-v5``
+    :return: name of the task, such as ``HalfCheetah``
+    :raises ValueError: if there is no such task; the message names the nearest ones
     """
     ids = registered_tasks()
     plain = name.rpartition(":")[2].removeprefix(_NAMESPACE)
@@ -157,14 +165,14 @@ def task_named(name: str) -> str:
 
 
 def _likeness(one: str, other: str) -> tuple[bool, float]:
-    """More for names that are alike, most for those of which one holds the other."""
+    """Likeness of two names: larger for names that are more alike, largest where one contains the other."""
     return one in other or other in one, SequenceMatcher(None, one, other).ratio()
 
 
 def is_batched(env_id: str) -> bool:
     """
-    :param env_id: of an environment
-    :return: whether it is of a suite whose simulator steps many environments at once
+    :param env_id: id of an environment
+    :return: whether its simulator steps many environments at once
     """
     suite = suite_of(env_id)
     return suite is not None and "vec_entry_point" in SUITES[suite].environments[env_id]
@@ -172,8 +180,10 @@ def is_batched(env_id: str) -> bool:
 
 def batch_factory(env_id: str) -> tuple[Callable[..., Any], dict[str, Any]]:
     """
-    :param env_id: of an environment that :func:`is_batched`
-    :return: what makes vectorised environments, given ``n_envs``, and the task's keyword arguments of it
+    Find the function that makes an environment's vectorised form.
+
+    :param env_id: id of an environment for which :func:`is_batched` is true
+    :return: function that makes vectorised environments, given ``n_envs``, and the task's keyword arguments for it
     :raises ValueError: if its simulator steps one environment at a time
     """
     if not is_batched(env_id):
@@ -185,16 +195,16 @@ def batch_factory(env_id: str) -> tuple[Callable[..., Any], dict[str, Any]]:
 
 def task_of(env_id: str) -> str:
     """
-    :param env_id: ``sb3_gac/<task>-v<version>``
-    :return: the task, as presets and benchmarks name it
+    :param env_id: id of the form ``sb3_gac/<task>-v<version>``
+    :return: name of the task, as presets and benchmarks have it
     """
     return env_id.removeprefix(_NAMESPACE).rpartition("-v")[0]
 
 
 def shows_whole_state(task: str) -> bool:
     """
-    :param task: see :func:`task_of`
-    :return: whether its privileged entry has all that ``partial`` shows; of a task that is none of this package's, ``True``
+    :param task: name of a task, as :func:`task_of` returns it
+    :return: whether the task's privileged entry has all that ``partial`` shows; ``True`` if no suite has the task
     """
     suite = suite_of(env_id := registered_tasks().get(task, ""))
     return suite is None or SUITES[suite].shows_whole_state(env_id)

@@ -1,5 +1,5 @@
 """
-The paper's five tasks in Brax, its simulator, with the backend ``spring``: split as in the paper's Table 7.
+The paper's five tasks in Brax, with the paper's backend ``spring``, split as in its Table 7.
 
 =======================  ====================================================  =======  =====================
 task                     Brax's observation                                    partial  privileged="velocity"
@@ -11,7 +11,7 @@ brax-InvertedDouble\\     x, sin 2, cos 2, qd 3 (clipped to +-10)               
 Pendulum
 =======================  ====================================================  =======  =====================
 
-``privileged="state"`` is the whole clean state: the velocities, and what ``partial`` shows, without its noise.  Episodes are
+``privileged="state"`` is the whole clean state: the velocities, and the components of ``partial`` without noise.  Episodes are
 truncated after 1,000 steps, and actions are in [-1, 1].  All environments are stepped together::
 
     env = sb3_gac.envs.make_vec("sb3_gac/brax-HalfCheetah-v0", n_envs=128, noise_std=0.1)
@@ -35,11 +35,11 @@ TIME_LIMIT = 1000
 
 
 def _humanoid(name: str) -> TaskLayout:
-    """Brax's layout: q[2:] 0:22, qd 22:45, inertia about the centre of mass 45:155, its velocity 155:221, torques 221:244."""
+    """The layout q[2:] 0:22, qd 22:45, inertia 45:155 and velocity 155:221 about the centre of mass, torques 221:244."""
     return TaskLayout(name, (*range(22), *range(45, 155), *range(221, 244)), (*range(22, 45), *range(155, 221)))
 
 
-#: Task -> where Brax's observation holds what, under Brax's name
+#: Task -> layout of Brax's observation, with Brax's name of the task
 TASKS: dict[str, TaskLayout] = {
     "InvertedDoublePendulum": positions_first("inverted_double_pendulum", 5, 3),
     "HalfCheetah": positions_first("halfcheetah", 8, 9),
@@ -62,15 +62,16 @@ def make_brax(
     """
     Build environments that Brax steps together.
 
-    :param task: a key of ``TASKS``
-    :param n_envs: side by side
+    :param task: name of the task, a key of ``TASKS``
+    :param n_envs: number of environments side by side
     :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
-    :param backend: of Brax: "spring" as in the paper, "positional", "generalized" or "mjx"
-    :param time_limit: steps after which an episode is truncated
-    :param kwargs: of Brax's environment
-    :raises ValueError: if ``task`` or ``privileged`` is unknown, or ``noise_std`` negative
-    :raises ImportError: if Brax is not installed, saying how to install it
+    :param backend: physics of Brax: "spring" as in the paper, "positional", "generalized" or "mjx"
+    :param time_limit: number of steps after which an episode is truncated
+    :param kwargs: keyword arguments of Brax's environment
+    :return: vectorised environments
+    :raises ValueError: if ``task`` or ``privileged`` is unknown, or ``noise_std`` is negative
+    :raises ImportError: if Brax is not installed; the message says how to install it
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
@@ -94,7 +95,7 @@ def make_brax(
     )
 
 
-#: Id -> how gymnasium makes it; time limits are counted by the vectorised environments
+#: Id -> arguments of its registration; the vectorised environments count the time limits
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     f"sb3_gac/brax-{task}-v0": {
         "vec_entry_point": f"{__name__}:make_brax",

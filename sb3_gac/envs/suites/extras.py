@@ -1,4 +1,4 @@
-"""What is installed on request, and the one sentence that says how, wherever it is missing."""
+"""Extras of this package, and the one sentence that says how to install them, wherever they are missing."""
 
 from importlib import import_module
 from typing import Any
@@ -6,11 +6,13 @@ from typing import Any
 
 def import_extra(module: str, extra: str, user: str) -> Any:
     """
-    :param module: that is imported when it is needed
-    :param extra: of this package, with which it is installed
-    :param user: what needs it, such as an environment's id, for the message
-    :return: the module
-    :raises ImportError: if it is not installed, saying how to
+    Import a module that an extra of this package installs.
+
+    :param module: path of the module to import
+    :param extra: extra of this package that installs the module
+    :param user: name of what needs the module, such as an environment's id, for the message
+    :return: imported module
+    :raises ImportError: if the module is not installed; the message says how to install it
     """
     try:
         return import_module(module)
@@ -20,10 +22,10 @@ def import_extra(module: str, extra: str, user: str) -> Any:
 
 def missing_extra(user: str, missing: str, extra: str) -> ImportError:
     """
-    :param user: what can't be used without the extra
-    :param missing: module, or modules, that are not there
-    :param extra: of this package, that has them
-    :return: an error that says how to install it
+    :param user: name of what can't be used without the extra
+    :param missing: name of the missing module, or of several
+    :param extra: extra of this package that installs them
+    :return: error whose message says how to install the extra
     """
     return ImportError(
         f'{user} needs {missing}, which the extra sb3_gac[{extra}] has: pip install -e ".[{extra}]" in the clone of sb3_gac.',

@@ -1,5 +1,5 @@
 """
-HumanoidBench, the paper's sixteen tasks of its Table 8, with the user's own installation: no package index has it.
+HumanoidBench: the sixteen tasks of the paper's Table 8.  Users install it by hand, since no package index has it.
 
 ==============  ====================================  ==============================================
 robot           partial                               privileged="hidden"
@@ -8,7 +8,8 @@ h1, 19 motors   qpos 26; with a ball 33               qvel 25; with a ball 31
 h1touch, 61     the standard observation, 164 to 308  53 touch sensors, 1,344 numbers, on a log scale
 ==============  ====================================  ==============================================
 
-``privileged="state"`` is all of both columns, clean.  ``insert_small`` has 190 numbers today, the paper says 164.
+``privileged="state"`` is all of both columns, without noise.  ``insert_small`` has 190 numbers in HumanoidBench's present
+version; the paper says 164.
 """
 
 from collections.abc import Iterator
@@ -26,7 +27,7 @@ from sb3_gac.envs.suites.layout import noisy_with_history
 from sb3_gac.envs.wrappers import Observation, SplitDictObservation, reset_with
 
 PRIVILEGED_CHOICES = ("hidden", "state")
-#: Task -> numbers that ``partial`` has
+#: Task -> size of ``partial``
 LOCOMOTION = {
     "basketball": 33,
     "crawl": 26,
@@ -48,9 +49,9 @@ MANIPULATION = {
     "window": 171,
 }
 TASKS = (*(f"h1-{task}" for task in LOCOMOTION), *(f"h1touch-{task}" for task in MANIPULATION))
-_SHORT = ("basketball", "insert_normal", "insert_small")  # 500 steps
+_SHORT = ("basketball", "insert_normal", "insert_small")  # tasks whose time limit is 500 steps
 _TOUCH_SUFFIX = "_touch"
-_RANDOM_STREAM = 0x7461736B  # keeps it apart from generators that others seed with the same number
+_RANDOM_STREAM = 0x7461736B  # separates the tasks' draws from generators that others seed with the same number
 INSTALL = (
     "clone github.com/carlosferrazza/humanoid-bench, pip install dm_control jax, and in the clone pip install --no-deps -e . "
     "(the versions that it pins are not needed)"
@@ -59,15 +60,17 @@ INSTALL = (
 
 class SeededTask(gym.Wrapper):
     """
-    A task of HumanoidBench whose resets are of its own seed: some draw from numpy's global generator, which is as it was
-    afterwards.  A checkpoint has what the task itself counts, beside MuJoCo's state.
+    A task of HumanoidBench whose resets depend on its own seed alone.
 
-    :param robot: a key of ``humanoid_bench.env.ROBOTS``
-    :param task: a key of ``humanoid_bench.env.TASKS``
-    :param render_mode: of ``render``; HumanoidBench is not told of it when it is made, or it would open a window's context,
-        which needs OpenGL, though nothing is to be drawn
-    :param kwargs: of ``HumanoidEnv``
-    :raises ImportError: if HumanoidBench, or what it imports, is not there
+    Some tasks draw from numpy's global generator; here that generator is afterwards as it was before.  A checkpoint has the
+    task's own counters, beside MuJoCo's state.
+
+    :param robot: name of the robot, a key of ``humanoid_bench.env.ROBOTS``
+    :param task: name of the task, a key of ``humanoid_bench.env.TASKS``
+    :param render_mode: mode of ``render``. HumanoidBench is made without it: it would open a context of OpenGL at once, though
+        nothing is to be drawn
+    :param kwargs: further keyword arguments for ``HumanoidEnv``
+    :raises ImportError: if HumanoidBench, or a module that it imports, is not installed
     """
 
     def __init__(self, robot: str, task: str, render_mode: str | None = None, **kwargs: Any):
@@ -80,8 +83,8 @@ class SeededTask(gym.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
-        :param seed: of the environment, and of what its task draws
-        :param options: of the environment
+        :param seed: seed of the environment and of its task's draws, ``None`` to go on with their random numbers
+        :param options: options of the environment's reset
         :return: observation, info
         """
         if seed is not None:
@@ -91,21 +94,26 @@ class SeededTask(gym.Wrapper):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """
-        :param action: of the robot
+        :param action: action for the robot
         :return: observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         return observation, float(reward), bool(terminated), bool(truncated), info
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """What :mod:`sb3_gac.envs.state` writes down: the generator, and numbers, texts, lists and arrays of the task."""
+        """
+        :return: state for :mod:`sb3_gac.envs.state`: the generator, and the task's attributes that are numbers, strings,
+            arrays or lists of these
+        """
         task = vars(self.unwrapped.task)  # type: ignore[attr-defined]
         plain = {name: _copied(value) for name, value in task.items() if _is_plain(value)}
         return {"generator": deepcopy(self._generator), "task": plain}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """
-        :param state: of :meth:`checkpoint_state`
+        Put the task back into a state.
+
+        :param state: state that :meth:`checkpoint_state` returned
         """
         self._generator = state["generator"]
         vars(self.unwrapped.task).update(state["task"])  # type: ignore[attr-defined]
@@ -120,10 +128,12 @@ def _make_again(robot: str, task: str, kwargs: dict[str, Any]) -> SeededTask:
 
 class WithSensors(gym.ObservationWrapper):
     """
-    What a robot knows by groups: ``qpos`` and ``qvel`` of one without touch, ``observation`` and ``touch`` of one with it.
-    Touch has three directions, two of them of either sign and up to thousands: sign(x) log(1 + abs(x)).
+    A robot's observation by groups: ``qpos`` and ``qvel`` without touch sensors, ``observation`` and ``touch`` with them.
 
-    :param env: one of MuJoCo's, whose observation begins with positions and velocities
+    Touch has three directions. Values x in two of them are of either sign and up to thousands, so all are shown as
+    sign(x) log(1 + abs(x)).
+
+    :param env: MuJoCo environment whose observation begins with positions and velocities
     """
 
     def __init__(self, env: gym.Env):
@@ -140,8 +150,8 @@ class WithSensors(gym.ObservationWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """
-        :param seed: of the environment
-        :param options: of the environment
+        :param seed: seed of the environment, ``None`` to go on with its random numbers
+        :param options: options of the environment's reset
         :return: observation, info
         """
         observation, info = reset_with(self.env, seed, options)
@@ -149,8 +159,8 @@ class WithSensors(gym.ObservationWrapper):
 
     def observation(self, observation: np.ndarray) -> Observation:
         """
-        :param observation: of the environment
-        :return: by group
+        :param observation: observation of the environment, a vector
+        :return: group -> its values, a vector
         """
         if self.groups[1] == "qvel":
             values = np.split(observation, [self._n_positions])
@@ -173,14 +183,16 @@ def make_humanoid_bench(
     Build a task without its time limit, which ``gymnasium.make("sb3_gac/<task>-v0")`` adds.
 
     :param task: one of ``TASKS``, such as "h1-walk"
-    :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units
-    :param privileged: "hidden" for what ``partial`` lacks; "state" for that and all that ``partial`` shows, without its noise
-    :param history: observations that ``partial`` holds, the newest last, followed by the actions between them
-    :param delay: steps by which ``partial`` is late
+    :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
+    :param privileged: privileged entry: "hidden" for the components that ``partial`` lacks; "state" for these and the
+        components of ``partial`` without noise
+    :param history: number of observations in ``partial``, the newest last, followed by the actions between them
+    :param delay: number of steps by which ``partial`` is late
     :param drop: probability that an observation of ``partial`` is lost, and the last one shown again
-    :param kwargs: of ``humanoid_bench.env.HumanoidEnv``
-    :raises ValueError: naming the argument that is wrong
-    :raises ImportError: if HumanoidBench is not installed, saying how to
+    :param kwargs: keyword arguments for ``humanoid_bench.env.HumanoidEnv``
+    :return: environment with ``partial`` and ``privileged``
+    :raises ValueError: if an argument is wrong; the message names it
+    :raises ImportError: if HumanoidBench is not installed; the message says how to install it
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {list(TASKS)}, got {task!r}.")
@@ -205,7 +217,7 @@ def _import_bench(environment: str) -> Any:
 
 
 def _without_fields_that_are_gone(array_sizes: dict[str, dict[str, Any]]) -> None:
-    """HumanoidBench asks MuJoCo for each field in this table, of which its present version has some no more."""
+    """Drop fields that the present MuJoCo lacks from HumanoidBench's table, since it asks MuJoCo for each of them."""
     import mujoco
 
     for struct, kind in {"mjmodel": mujoco.MjModel, "mjdata": mujoco.MjData}.items():
@@ -239,19 +251,19 @@ def _copied(value: Any) -> Any:
 
 def _shapes(task: str) -> dict[str, tuple[int]]:
     robot, _, name = task.partition("-")
-    if robot == "h1":  # a free body's orientation is four numbers, and three as a velocity
+    if robot == "h1":  # a free body's orientation is four numbers, its angular velocity three
         n_bodies = 2 if name == "basketball" else 1
         return {PARTIAL: (LOCOMOTION[name],), PRIVILEGED: (LOCOMOTION[name] - n_bodies,), "action": (19,)}
     return {PARTIAL: (MANIPULATION[name],), PRIVILEGED: (1344,), "action": (61,)}
 
 
-#: Id -> how gymnasium makes it, with its time limit
+#: Id -> arguments of its registration, with its time limit
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     f"sb3_gac/{task}-v0": {
         "entry_point": f"{__name__}:make_humanoid_bench",
         "max_episode_steps": 500 if task.partition("-")[2] in _SHORT else 1000,
         "kwargs": {"task": task},
-        "disable_env_checker": True,  # which would look at every step, and is asked in tests
+        "disable_env_checker": True,  # the checker would look at every step; tests run it
         "shapes": _shapes(task),
         "whole_state": False,
     }

@@ -1,4 +1,4 @@
-"""Tasks whose observation is split by position: noisy positions, and what only a simulator knows of velocities."""
+"""Tasks whose observation is split by index: noisy positions, and velocities that only a simulator knows."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,12 +14,12 @@ PRIVILEGED_CHOICES = ("state", "velocity")
 @dataclass(frozen=True)
 class TaskLayout:
     """
-    Where a task's observation holds what.
+    The layout of a task's observation.
 
-    :param env_id: the simulator's own id
+    :param env_id: simulator's own id of the task
     :param partial: indices of positions and other quantities without velocities
     :param velocity: indices of velocities
-    :param kwargs: of ``gymnasium.make``
+    :param kwargs: keyword arguments for ``gymnasium.make``
     """
 
     env_id: str
@@ -30,10 +30,13 @@ class TaskLayout:
 
 def positions_first(env_id: str, n_positions: int, n_velocities: int, **kwargs: Any) -> TaskLayout:
     """
-    :param env_id: the simulator's own id
-    :param n_positions: at the observation's beginning
-    :param n_velocities: after them
-    :param kwargs: of ``gymnasium.make``
+    Make the layout of an observation that begins with positions, followed by velocities.
+
+    :param env_id: simulator's own id of the task
+    :param n_positions: number of positions, at the observation's beginning
+    :param n_velocities: number of velocities, after the positions
+    :param kwargs: keyword arguments for ``gymnasium.make``
+    :return: layout of the task's observation
     """
     size = n_positions + n_velocities
     return TaskLayout(env_id, tuple(range(n_positions)), tuple(range(n_positions, size)), kwargs)
@@ -41,9 +44,9 @@ def positions_first(env_id: str, n_positions: int, n_velocities: int, **kwargs: 
 
 def visible_in(layout: TaskLayout, privileged: str) -> tuple[int, ...]:
     """
-    :param layout: of the task
+    :param layout: layout of the task's observation
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
-    :return: indices of the privileged entry
+    :return: indices of the privileged entry's components
     :raises ValueError: if ``privileged`` is unknown
     """
     if privileged not in PRIVILEGED_CHOICES:
@@ -63,14 +66,15 @@ def make_task(
     """
     Build a task without its time limit.
 
-    :param layout: of the task
+    :param layout: layout of the task's observation
     :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
-    :param history: observations that ``partial`` holds, see :func:`noisy_with_history`
-    :param delay: steps by which ``partial`` is late
-    :param drop: probability that an observation of ``partial`` is lost
-    :param kwargs: of the gymnasium environment
-    :raises ValueError: naming the argument that is wrong
+    :param history: number of observations in ``partial``, with actions between them, as in :func:`noisy_with_history`
+    :param delay: number of steps by which ``partial`` is late
+    :param drop: probability that an observation of ``partial`` is lost, and the last one shown again
+    :param kwargs: further keyword arguments for ``gymnasium.make``, which override those of the layout
+    :return: environment with ``partial`` and ``privileged``
+    :raises ValueError: if an argument is wrong; the message names it
     """
     visible = visible_in(layout, privileged)
     env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs}).unwrapped
@@ -79,14 +83,15 @@ def make_task(
 
 def noisy_with_history(env: gym.Env, noise_std: float, history: int = 1, delay: int = 0, drop: float = 0.0) -> gym.Env:
     """
-    What every suite's ``partial`` may have: sensor noise, a delay, losses, and a short memory of what has arrived.
+    Give ``partial`` sensor noise, a delay, losses, and a short history of the observations that have arrived.
 
-    :param env: with an entry ``partial``
+    :param env: environment with an entry ``partial``
     :param noise_std: standard deviation of the noise on ``partial``, in its own units; 0 for none
-    :param history: noisy observations that ``partial`` then holds, the newest last, followed by the actions between them;
-        1 for the newest alone
-    :param delay: steps by which noisy observations are late
-    :param drop: probability that one is lost, and the last one shown again
+    :param history: number of noisy observations in ``partial``, the newest last, followed by the actions between them; 1 for
+        the newest alone
+    :param delay: number of steps by which noisy observations are late
+    :param drop: probability that a noisy observation is lost, and the last one shown again
+    :return: environment in these wrappers
     :raises ValueError: if ``noise_std`` is negative, ``history`` no positive integer, ``delay`` no integer of at least 0, or
         ``drop`` no probability
     """

@@ -1,5 +1,5 @@
 """
-MuJoCo locomotion with noisy positions: gymnasium's v5 tasks, split as in the paper's Table 7 where v5 allows.
+MuJoCo locomotion with noisy positions: gymnasium's v5 tasks, split as in the paper's Table 7 where v5 allows it.
 
 =======================  ====================================================  =======  ========================
 task                     v5 observation                                        partial  privileged="velocity"
@@ -13,7 +13,7 @@ Walker2d                 qpos[1:] 8, qvel 9 (clipped to +-10)                  8
 Swimmer                  qpos[2:] 3, qvel 5                                    3        5
 =======================  ====================================================  =======  ========================
 
-``privileged="state"`` is the whole clean state: the velocities, and what ``partial`` shows, without its noise.  These
+``privileged="state"`` is the whole clean state: the velocities, and the components of ``partial`` without noise.  The tasks
 are equivalents of the paper's Brax tasks, not reproductions: time step and control ranges are gymnasium's.
 """
 
@@ -34,7 +34,7 @@ def _humanoid(env_id: str) -> TaskLayout:
     return TaskLayout(env_id, partial, velocity, {"include_cfrc_ext_in_observation": False})
 
 
-#: In an XML of gymnasium's, where nobody who makes a task can change it
+#: Warning about one of gymnasium's XML files, which users of a task can't change
 _DEPRECATED = "compiler attribute 'settotalmass' is deprecated"
 
 
@@ -62,14 +62,15 @@ def make_mujoco(
     """
     Build a task without its time limit, which ``gymnasium.make("sb3_gac/<task>-v5")`` adds.
 
-    :param task: a key of ``TASKS``
+    :param task: name of the task, a key of ``TASKS``
     :param noise_std: standard deviation of the noise on ``partial``, in the observation's own units; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
-    :param history: noisy observations that ``partial`` holds, the newest last, followed by the actions between them
-    :param delay: steps by which ``partial`` is late
+    :param history: number of noisy observations in ``partial``, the newest last, followed by the actions between them
+    :param delay: number of steps by which ``partial`` is late
     :param drop: probability that an observation of ``partial`` is lost, and the last one shown again
-    :param kwargs: of the gymnasium environment, but for those that change its observation
-    :raises ValueError: if the task is unknown, another argument is wrong, or ``kwargs`` change the layout
+    :param kwargs: keyword arguments of gymnasium's environment, except those that change its observation
+    :return: environment with ``partial`` and ``privileged``
+    :raises ValueError: if the task is unknown, another argument is wrong, or ``kwargs`` change the observation
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
@@ -83,8 +84,9 @@ def make_mujoco(
 @contextmanager
 def _without_deprecation() -> Iterator[None]:
     """
-    While a model is compiled, MuJoCo would write :data:`_DEPRECATED` to stderr and to a file in the working directory. What
-    else it warns of goes where it went before: to a handler, or, where there was none, to Python's warnings.
+    Silence the warning :data:`_DEPRECATED`, which MuJoCo would write to stderr and to a file in the working directory.
+
+    All other warnings of MuJoCo go to the handler that was set before, or, where there was none, to Python's warnings.
     """
     import mujoco
 
@@ -105,7 +107,7 @@ def _without_deprecation() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-#: Id -> how gymnasium makes it, with its time limit of 1,000 steps
+#: Id -> arguments of its registration, with its time limit of 1,000 steps
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     f"sb3_gac/{task}-v5": {
         "entry_point": f"{__name__}:make_mujoco",

@@ -1,4 +1,4 @@
-"""Pendulum whose angular velocity only the simulator knows: cheap physics, for which a policy needs a memory."""
+"""Pendulum with a hidden angular velocity: its physics is cheap, and a policy needs a memory for it."""
 
 from typing import Any
 
@@ -22,18 +22,19 @@ def make_pendulum(
 
     ``partial`` is the angle's cosine and sine.
 
-    :param noise_std: standard deviation of the noise on ``partial``; 0 for none
+    :param noise_std: standard deviation of the noise on the cosine and the sine; 0 for none
     :param privileged: "state" for the whole clean state, "velocity" for the angular velocity alone
-    :param history: observations that ``partial`` holds, the newest last, followed by the actions between them
-    :param delay: steps by which ``partial`` is late
+    :param history: number of observations in ``partial``, the newest last, followed by the actions between them
+    :param delay: number of steps by which ``partial`` is late
     :param drop: probability that an observation of ``partial`` is lost, and the last one shown again
-    :param kwargs: of the gymnasium environment
-    :raises ValueError: naming the argument that is wrong
+    :param kwargs: keyword arguments of gymnasium's environment
+    :return: environment with ``partial`` and ``privileged``
+    :raises ValueError: if an argument is wrong; the message names it
     """
     return make_task(LAYOUT, noise_std, privileged, history, delay, drop, **kwargs)
 
 
-#: Id -> how gymnasium makes it, with its time limit of 200 steps
+#: Id -> arguments of its registration, with its time limit of 200 steps
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "sb3_gac/Pendulum-v1": {"entry_point": f"{__name__}:make_pendulum", "max_episode_steps": 200}
 }

@@ -1,9 +1,9 @@
 """
-MuJoCo locomotion from pixels: the last frames of a camera that follows the robot, and privileged the simulator's state.
+MuJoCo locomotion from pixels: ``partial`` is the last frames of a camera that follows the robot.
 
 ``partial`` is uint8, channels first, (3 * frames, size, size), the oldest frame first; at an episode's start the first frame
-repeats.  ``privileged`` is the clean state of :mod:`sb3_gac.envs.suites.mujoco`, as is what a step does.  MuJoCo draws with
-OpenGL, see :data:`sb3_gac.envs.camera.HOW_TO_RENDER`.
+repeats.  ``privileged`` is the clean state, as in :mod:`sb3_gac.envs.suites.mujoco`, and the dynamics are the same.  MuJoCo
+draws with OpenGL; :data:`sb3_gac.envs.camera.HOW_TO_RENDER` says how to enable it.
 """
 
 from typing import Any
@@ -32,17 +32,18 @@ def make_pixels(
     """
     Build a task without its time limit, which ``gymnasium.make("sb3_gac/<task>Pixels-v5")`` adds.
 
-    :param task: one of ``TASKS``
-    :param frames: that ``partial`` has
-    :param size: pixels of each side
-    :param camera: its name in the model
+    :param task: name of the task, one of ``TASKS``
+    :param frames: number of frames in ``partial``
+    :param size: height and width of a frame, in pixels
+    :param camera: name of the camera in MuJoCo's model
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
-    :param noise_std: 0: grey levels have no use for it
-    :param delay: steps by which frames are late
+    :param noise_std: standard deviation of sensor noise, which must be 0 for images
+    :param delay: number of steps by which frames are late
     :param drop: probability that a frame is lost, and the last one shown again
-    :param kwargs: of the gymnasium environment, but for those that change its observation
-    :raises ValueError: if an argument is none of these, or ``noise_std`` is not 0, or ``delay`` or ``drop`` wrong
-    :raises NoRenderingError: at the first reset, if there is no OpenGL to draw with
+    :param kwargs: keyword arguments of gymnasium's environment, except those that change its observation
+    :return: environment with ``partial`` and ``privileged``
+    :raises ValueError: if the task is unknown, ``noise_std`` is not 0, or another argument is wrong
+    :raises NoRenderingError: if there is no OpenGL to draw with, here or at the first reset
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {list(TASKS)}, got {task!r}.")
@@ -52,14 +53,14 @@ def make_pixels(
             "each pixel by itself hides nothing from an encoder, which averages over many."
         )
     try:
-        import mujoco  # noqa: F401  # which looks for OpenGL at once, where MUJOCO_GL says of which kind
+        import mujoco  # noqa: F401  # looks for OpenGL at once, where MUJOCO_GL says of which kind
     except Exception as error:
         raise no_rendering(error) from error
     env = make_mujoco(task, noise_std=0.0, privileged=privileged, **kwargs)
     return History(delayed_and_dropped(CameraImage(env, size, camera), delay, drop), length=frames)
 
 
-#: Id -> how gymnasium makes it, with its time limit of 1,000 steps
+#: Id -> arguments of its registration, with its time limit of 1,000 steps
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     f"sb3_gac/{task}Pixels-v5": {
         "entry_point": f"{__name__}:make_pixels",

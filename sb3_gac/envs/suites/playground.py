@@ -1,9 +1,9 @@
 """
-MuJoCo Playground: robots and hands whose designers drew the line between what a robot senses and what only training knows.
+MuJoCo Playground: robots and hands whose designers separated the robot's senses from knowledge for training alone.
 
-``partial`` is the task's ``state``, with the noise of sensors that the task has itself, and ``privileged`` its
-``privileged_state``, which begins with ``state`` to the bit: critics on ``privileged`` alone lose nothing.  EnvPool (extra
-``envpool``) simulates them with C MuJoCo on the CPU; with ``backend="mjx"`` Playground itself does (extra ``playground``), on
+``partial`` is the task's ``state``, with the task's own sensor noise, and ``privileged`` its ``privileged_state``, which
+begins with ``state`` to the bit: critics on ``privileged`` alone lose nothing.  EnvPool (extra ``envpool``) simulates the
+tasks with C MuJoCo on the CPU.  With ``backend="mjx"`` Playground itself simulates them (extra ``playground``), on
 accelerators.
 """
 
@@ -19,12 +19,12 @@ from sb3_gac.envs.suites.extras import import_extra
 
 class Robot(NamedTuple):
     """
-    A task.
+    The sizes of a task.
 
-    :param actions: number of them, each in [-1, 1]
+    :param actions: number of an action's components, each in [-1, 1]
     :param partial: size of ``state``
     :param privileged: size of ``privileged_state``
-    :param time_limit: steps of an episode
+    :param time_limit: number of steps after which an episode is truncated
     """
 
     actions: int
@@ -57,13 +57,14 @@ def make_playground(task: str, n_envs: int = 1, backend: str = "envpool", **kwar
     """
     Build vectorised environments of a task; ``sb3_gac.envs.make_vec("sb3_gac/<task>-v0")`` does so by id.
 
-    :param task: a key of ``TASKS``
+    :param task: name of the task, a key of ``TASKS``
     :param n_envs: number of environments
-    :param backend: "envpool", on the CPU, or "mjx", on JAX's default device, of Playground itself
-    :param kwargs: ``noise_std``, ``time_limit``, and the backend's own: of :class:`sb3_gac.envs.EnvPoolVecEnv`, such as
-        ``num_threads`` and the task's ``noise_level``; or of :func:`make_mjx`
+    :param backend: simulator: "envpool" on the CPU, or "mjx", which is Playground itself, on JAX's default device
+    :param kwargs: ``noise_std``, ``time_limit``, and further keyword arguments of the backend: those of
+        :class:`sb3_gac.envs.EnvPoolVecEnv`, such as ``num_threads`` and the task's ``noise_level``, or of :func:`make_mjx`
+    :return: vectorised environments
     :raises ValueError: if the task or the backend is unknown
-    :raises ImportError: if the simulator is not installed, saying how to
+    :raises ImportError: if the simulator is not installed; the message says how to install it
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
@@ -73,7 +74,7 @@ def make_playground(task: str, n_envs: int = 1, backend: str = "envpool", **kwar
 
 
 def _make_envpool(task: str, n_envs: int, **kwargs: Any) -> Any:
-    import_extra("envpool", "envpool", f"sb3_gac/{task}-v0")  # before SB3 and torch, which take seconds
+    import_extra("envpool", "envpool", f"sb3_gac/{task}-v0")  # before the imports of SB3 and torch, which take seconds
     from sb3_gac.envs.vector.envpool import EnvPoolVecEnv
 
     return EnvPoolVecEnv(f"MuJoCoPlayground/{task}-v1", n_envs, **kwargs)
@@ -88,15 +89,16 @@ def make_mjx(
     **options: Any,
 ) -> Any:
     """
-    Build vectorised environments of a task of Playground itself, which fetches its robots when it is first used.
+    Build vectorised environments of a task by Playground itself, which fetches its robots when it is first used.
 
-    :param task: a key of ``TASKS``
+    :param task: name of the task, a key of ``TASKS``
     :param n_envs: number of environments
-    :param noise_level: of the noise that the task has itself, from 0 for none; by default, the task's own
-    :param impl: of MJX: "jax" or "warp"; by default "jax" on the CPU and the task's own elsewhere
-    :param config: of Playground, dotted name -> value, such as ``{"pert_config.enable": True}``
-    :param options: of :class:`~sb3_gac.envs.vector.base.BatchVecEnv`
-    :raises ImportError: if Playground is not installed, saying how to
+    :param noise_level: level of the task's own sensor noise, 0 for none, ``None`` for the task's own level
+    :param impl: implementation of MJX, "jax" or "warp"; ``None`` for "jax" on the CPU and the task's own elsewhere
+    :param config: changes to Playground's configuration, dotted name -> value, such as ``{"pert_config.enable": True}``
+    :param options: keyword arguments for :class:`~sb3_gac.envs.vector.base.BatchVecEnv`
+    :return: vectorised environments
+    :raises ImportError: if Playground is not installed; the message says how to install it
     """
     environment = f'sb3_gac/{task}-v0 with backend="mjx"'
     jax, playground = (import_extra(name, "playground", environment) for name in ("jax", "mujoco_playground"))
@@ -121,7 +123,7 @@ def make_mjx(
 _SPLIT = {"partial": ["state"], "privileged": ["privileged_state"]}
 BACKENDS: dict[str, Callable[..., Any]] = {"envpool": _make_envpool, "mjx": make_mjx}
 
-#: Id -> how gymnasium makes it; time limits are counted by the vectorised environments
+#: Id -> arguments of its registration; the vectorised environments count the time limits
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     f"sb3_gac/{task}-v0": {
         "vec_entry_point": f"{__name__}:make_playground",

@@ -1,8 +1,8 @@
 """
 The fifteen POPGym tasks of the paper: games that are won by remembering, with a summary of the history as privileged entry.
 
-What is privileged says only what a player with a perfect memory knows: never a ship, a mine or a card that was not shown.
-POPGym (extra ``popgym``) is imported when a task is made.
+The summary says only what a player with a perfect memory knows: never a ship, a mine or a card that was not shown.  POPGym
+(extra ``popgym``) is imported when a task is made.
 """
 
 from abc import ABC, abstractmethod
@@ -23,17 +23,18 @@ LEVELS = ("Easy", "Medium", "Hard")
 
 def _one_hot(values: np.ndarray, n_values: int) -> np.ndarray:
     """
-    :param values: integers below ``n_values``
-    :return: shape (number of values * n_values,)
+    :param values: integers from 0 to ``n_values`` - 1, of any shape
+    :param n_values: number of different integers
+    :return: one-hot vectors of all values, end to end, shape (number of values * n_values,)
     """
     return np.eye(n_values, dtype=np.float32)[np.ravel(values)].ravel()
 
 
 class Summary(ABC):
     """
-    What a player with a perfect memory knows, as a vector in [0, 1].
+    The knowledge of a player with a perfect memory, as a vector in [0, 1].
 
-    :param game: of POPGym
+    :param game: game of POPGym
     """
 
     size: int
@@ -44,8 +45,10 @@ class Summary(ABC):
     @abstractmethod
     def of(self, observation: Any) -> np.ndarray:
         """
-        :param observation: the game's newest
-        :return: shape (size,)
+        Summarise the game after its newest observation.
+
+        :param observation: newest observation of the game
+        :return: summary of the game so far, float32, shape (size,)
         """
 
 
@@ -55,7 +58,10 @@ class CardToName(Summary):
     size = 5
 
     def of(self, observation: Any) -> np.ndarray:
-        """See :meth:`Summary.of`."""
+        """
+        :param observation: newest observation of the game, which is not read
+        :return: one-hot suit to be named, the last component for none, shape (5,)
+        """
         card = self._card()
         named = np.zeros(5, dtype=np.float32)
         named[4 if card is None else self.game.deck.suits_idx[card]] = 1.0
@@ -63,11 +69,11 @@ class CardToName(Summary):
 
     @abstractmethod
     def _card(self) -> Any:
-        """What is to be named, None if nothing is."""
+        """The card whose suit is to be named, ``None`` if there is none."""
 
 
 class LastCardLeft(CardToName):
-    """Autoencode: cards are named in reverse, once all were shown."""
+    """Autoencode: once all cards were shown, they are named in reverse order."""
 
     def _card(self) -> Any:
         cards = self.game.deck["system"]
@@ -83,7 +89,12 @@ class CardBefore(CardToName):
 
 
 class Guesses(Summary):
-    """Battleship: which tiles were shot at; with ``hits``, also which of them were ships."""
+    """
+    Battleship: the tiles that were shot at, and on request those of them that were ships.
+
+    :param game: game of POPGym
+    :param hits: whether to show the ships that were hit as well
+    """
 
     def __init__(self, game: Any, hits: bool = False):
         super().__init__(game)
@@ -91,13 +102,20 @@ class Guesses(Summary):
         self.size = game.board_size**2 * (2 if hits else 1)
 
     def of(self, observation: Any) -> np.ndarray:
-        """See :meth:`Summary.of`."""
+        """
+        :param observation: newest observation of the game, which is not read
+        :return: 1 for each tile that was shot at, then, with ``hits``, 1 for each that was a ship, shape (size,)
+        """
         planes = [self.game.guesses, self.game.guesses * self.game.board] if self._hits else [self.game.guesses]
         return np.stack(planes).astype(np.float32).ravel()
 
 
 class SeenFaces(Summary):
-    """Concentration: the face that was last seen at each position, or that none was."""
+    """
+    Concentration: the face that was last seen at each position, or that none was seen.
+
+    :param game: game of POPGym
+    """
 
     def __init__(self, game: Any):
         super().__init__(game)
@@ -106,7 +124,10 @@ class SeenFaces(Summary):
         self._seen = np.empty(0, dtype=np.int64)
 
     def of(self, observation: Any) -> np.ndarray:
-        """See :meth:`Summary.of`."""
+        """
+        :param observation: face of each card, ``facedown_card`` where it is hidden, shape (number of cards,)
+        :return: one-hot face for each position, shape (size,)
+        """
         if self.game.curr_step == 0:
             self._seen = np.full(self.game.deck.num_cards, self.game.facedown_card, dtype=np.int64)
         self._seen = np.where(observation == self.game.facedown_card, self._seen, observation)
@@ -114,7 +135,11 @@ class SeenFaces(Summary):
 
 
 class ViewedSquares(Summary):
-    """MineSweeper: the number of mines around each square that was viewed, or that it was not."""
+    """
+    MineSweeper: the number of mines around each square, or that the square was not viewed.
+
+    :param game: game of POPGym
+    """
 
     VIEWED = 2
 
@@ -124,7 +149,10 @@ class ViewedSquares(Summary):
         self.size = int(np.prod(game.dims)) * self._n_values
 
     def of(self, observation: Any) -> np.ndarray:
-        """See :meth:`Summary.of`."""
+        """
+        :param observation: newest observation of the game, which is not read
+        :return: one-hot number of mines for each square, the last component for squares not viewed, shape (size,)
+        """
         viewed = self.game.hidden_grid == self.VIEWED
         return _one_hot(np.where(viewed, self.game.neighbor_grid, self._n_values - 1), self._n_values)
 
@@ -143,8 +171,8 @@ class SummarisedGame(gym.Wrapper):
     """
     A game with its observation as a vector, ``partial``, and a summary of its history, ``privileged``.
 
-    :param game: of POPGym
-    :param summary: of that game
+    :param game: game of POPGym
+    :param summary: summary of that game
     """
 
     def __init__(self, game: gym.Env, summary: Summary):
@@ -156,8 +184,8 @@ class SummarisedGame(gym.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """
-        :param seed: of the game
-        :param options: of the game
+        :param seed: seed of the game, ``None`` to go on with its random numbers
+        :param options: options of the game's reset
         :return: observation, info
         """
         observation, info = reset_with(self.env, seed, options)
@@ -165,7 +193,7 @@ class SummarisedGame(gym.Wrapper):
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
         """
-        :param action: of the game
+        :param action: action for the game
         :return: observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -178,11 +206,14 @@ class SummarisedGame(gym.Wrapper):
 
 def make_popgym(task: str, previous_reward: bool = False, **summary: Any) -> gym.Env:
     """
-    :param task: one of ``TASKS``
+    Build a task, whose ``partial`` has the previous action as well.
+
+    :param task: name of the task, one of ``TASKS``
     :param previous_reward: whether ``partial`` has the previous reward beside the previous action
-    :param summary: options of the game's privileged entry: ``hits=True`` for Battleship
+    :param summary: keyword arguments of the game's summary, such as ``hits=True`` for Battleship
+    :return: environment with ``partial`` and ``privileged``
     :raises ValueError: if the task is unknown
-    :raises ImportError: if POPGym is not installed
+    :raises ImportError: if POPGym is not installed; the message says how to install it
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {list(TASKS)}, got {task!r}.")
@@ -195,7 +226,7 @@ def make_popgym(task: str, previous_reward: bool = False, **summary: Any) -> gym
     return PreviousAction(env, reward=previous_reward)
 
 
-#: Id -> how gymnasium makes it; the games end by themselves
+#: Id -> arguments of its registration; the games end by themselves
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     f"sb3_gac/popgym-{task}-v0": {"entry_point": f"{__name__}:make_popgym", "kwargs": {"task": task}} for task in TASKS
 }

@@ -1,5 +1,5 @@
 """
-gymnasium-robotics: hands that feel, arms whose velocities only the simulator knows.
+gymnasium-robotics: hands with privileged touch sensors, and arms with privileged velocities.
 
 ================================  ==============================================  ====================================
 task                              partial                                         privileged="hidden"
@@ -13,7 +13,7 @@ HandReach                         joints 24, fingertips 15, desired goal 15 = 54
 AdroitHandDoor, AdroitHandRelocate  observation 39                                qvel 30 or 36, touch 21, log(1 + x)
 ================================  ==============================================  ====================================
 
-Achieved goals are part of these observations already.  ``privileged="state"`` is all of both columns, clean.
+Achieved goals are part of these observations already.  ``privileged="state"`` is all of both columns, without noise.
 """
 
 from collections.abc import Mapping
@@ -37,15 +37,15 @@ Selection = Mapping[str, tuple[int, ...] | None]
 @dataclass(frozen=True)
 class RobotTask:
     """
-    Where a task's observation holds what.
+    The layout of a task's observation.
 
-    :param env_id: gymnasium-robotics's id
-    :param max_episode_steps: of it
-    :param partial: entry -> indices of what a robot measures; ``None`` for the whole entry
-    :param hidden: likewise for what only a simulator knows
-    :param sizes: of ``partial`` with the goal, of what is hidden, and of an action
-    :param kwargs: of ``gymnasium.make``
-    :param has_goals: whether it is a goal environment
+    :param env_id: gymnasium-robotics's id of the task
+    :param max_episode_steps: number of steps after which an episode is truncated
+    :param partial: entry -> indices of the components that a robot measures; ``None`` for the whole entry
+    :param hidden: entry -> indices of the components that only a simulator knows; ``None`` for the whole entry
+    :param sizes: sizes of ``partial`` with the goal, of the hidden components, and of an action
+    :param kwargs: keyword arguments for ``gymnasium.make``
+    :param has_goals: whether the task is a goal environment
     """
 
     env_id: str
@@ -58,7 +58,7 @@ class RobotTask:
 
 
 def _touching(name: str) -> RobotTask:
-    """Observations of 61 numbers, and 92 touch sensors; of rewards, those by distance."""
+    """A hand with an observation of 61 numbers, 92 touch sensors, and rewards by distance."""
     partial, touch = {"observation": tuple(range(61))}, {"observation": tuple(range(61, 153))}
     kwargs = {"touch_get_obs": "log", "reward_type": "dense"}
     return RobotTask(f"HandManipulate{name}_ContinuousTouchSensors-v1", 100, partial, touch, (68, 92, 20), kwargs)
@@ -77,7 +77,7 @@ def _reaching_hand() -> RobotTask:
 
 
 def _adroit(name: str, n_velocities: int, n_actions: int) -> RobotTask:
-    """An observation of 39 numbers; 21 touch sensors."""
+    """A hand with an observation of 39 numbers, and 21 touch sensors."""
     hidden, sizes = {"qvel": None, "touch": None}, (39, n_velocities + 21, n_actions)
     return RobotTask(f"AdroitHand{name}-v1", 200, {"observation": None}, hidden, sizes, has_goals=False)
 
@@ -104,10 +104,11 @@ TASKS: dict[str, RobotTask] = {
 
 class WithSimulatorState(gym.ObservationWrapper):
     """
-    Beside an observation, what the simulator knows: ``qvel``, and ``touch``, log(1 + x) of the touch sensors, whose forces go
-    to hundreds.  Models have other sensors as well, of joints and actuators: these are left out.
+    Add the simulator's knowledge to an observation: velocities ``qvel``, and ``touch``, log(1 + x) of the touch sensors.
 
-    :param env: one of MuJoCo's, with a Box observation
+    The logarithm is there since forces x reach hundreds.  The model's other sensors, of joints and actuators, are left out.
+
+    :param env: MuJoCo environment with a Box observation
     """
 
     def __init__(self, env: gym.Env):
@@ -122,8 +123,8 @@ class WithSimulatorState(gym.ObservationWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """
-        :param seed: of the environment
-        :param options: of the environment
+        :param seed: seed of the environment, ``None`` to go on with its random numbers
+        :param options: options of the environment's reset
         :return: observation, info
         """
         observation, info = reset_with(self.env, seed, options)
@@ -131,8 +132,8 @@ class WithSimulatorState(gym.ObservationWrapper):
 
     def observation(self, observation: np.ndarray) -> Observation:
         """
-        :param observation: of the environment
-        :return: with ``qvel`` and ``touch`` as they are now
+        :param observation: observation of the environment
+        :return: entries ``observation``, ``qvel`` and ``touch``, the last two as the simulator has them now
         """
         data = self.unwrapped.data  # type: ignore[attr-defined]
         return {"observation": observation, "qvel": data.qvel, "touch": np.log1p(data.sensordata[self._touch])}
@@ -140,14 +141,14 @@ class WithSimulatorState(gym.ObservationWrapper):
 
 class Robot(gym.Env):
     """
-    An environment of gymnasium-robotics, which rewards other goals on request alone: SB3 takes whatever has ``compute_reward``
-    for a goal environment, whose observation must have the goals as entries.
+    An environment of gymnasium-robotics that has ``compute_reward`` on request alone.
 
-    A copy in another process is made anew, since joints' types need not be numbers there yet.
+    SB3 takes an environment with ``compute_reward`` for a goal environment, whose observation must have the goals as entries.
+    A copy in another process is made anew, since :class:`_ByNumber` need not be in place there yet.
 
-    :param env_id: gymnasium-robotics's id
-    :param rewards_goals: whether it has ``compute_reward``
-    :param kwargs: of ``gymnasium.make``
+    :param env_id: gymnasium-robotics's id of the environment
+    :param rewards_goals: whether the environment has ``compute_reward``, which rewards other goals
+    :param kwargs: keyword arguments for ``gymnasium.make``
     """
 
     def __init__(self, env_id: str, rewards_goals: bool = False, **kwargs: Any):
@@ -163,22 +164,22 @@ class Robot(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
-        :param seed: of the simulator
-        :param options: of the simulator
+        :param seed: seed of the simulator, ``None`` to go on with its random numbers
+        :param options: options of the simulator's reset
         :return: observation, info
         """
         return reset_with(self.simulated, seed, options)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """
-        :param action: of the robot
+        :param action: action for the robot
         :return: observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.simulated.step(action)
-        return observation, float(reward), bool(terminated), bool(truncated), info  # some are numpy's
+        return observation, float(reward), bool(terminated), bool(truncated), info  # some are of numpy's types
 
     def render(self) -> Any:
-        """A frame, as ``render_mode`` says."""
+        """Draw a frame in the form that ``render_mode`` names."""
         return self.simulated.render()
 
     def close(self) -> None:
@@ -187,7 +188,7 @@ class Robot(gym.Env):
 
     @property
     def goal(self) -> np.ndarray:
-        """Drawn at reset; an AttributeError where there is none."""
+        """Goal that the last reset drew; an environment without goals raises an ``AttributeError``."""
         goal: np.ndarray = self.simulated.goal
         return goal
 
@@ -197,7 +198,7 @@ class Robot(gym.Env):
 
     @property
     def _np_random(self) -> np.random.Generator | None:
-        """The simulator's generator, there is no other."""
+        """The simulator's random generator; this object has no other."""
         generator: np.random.Generator | None = self.simulated._np_random
         return generator
 
@@ -207,7 +208,7 @@ class Robot(gym.Env):
 
     @property
     def np_random_seed(self) -> int:
-        """Of the simulator's generator."""
+        """Seed of the simulator's random generator."""
         return int(self.simulated.np_random_seed)
 
     def __reduce__(self) -> Any:
@@ -231,17 +232,20 @@ def make_robotics(
     """
     Build a task without its time limit, which ``gymnasium.make("sb3_gac/<task>-v<version>")`` adds.
 
-    :param task: a key of ``TASKS``
-    :param noise_std: standard deviation of the noise on what ``partial`` measures, in its own units (rad, m, m/s); the desired
-        goal is a command, and has none
-    :param privileged: "hidden" for what ``partial`` lacks; "state" for that and all that ``partial`` shows, without its noise
-    :param history: measurements that ``partial`` holds, the newest last, with the actions between them
+    :param task: name of the task, a key of ``TASKS``
+    :param noise_std: standard deviation of the noise on the measurements in ``partial``, in their own units (rad, m, m/s); the
+        desired goal is a command, and has no noise
+    :param privileged: privileged entry: "hidden" for the components that ``partial`` lacks; "state" for these and the
+        components of ``partial`` without noise
+    :param history: number of measurements in ``partial``, the newest last, with the actions between them
     :param goal_entries: whether goals stay entries of their own, ``achieved_goal`` and ``desired_goal``, for
-        ``HerReplayBuffer``; then ``role_keys`` gives the deployed policy ``["partial", "desired_goal"]``
-    :param delay: steps by which what ``partial`` measures is late; the desired goal never is
+        ``HerReplayBuffer``; ``role_keys`` must then give the deployed policy ``["partial", "desired_goal"]``
+    :param delay: number of steps by which the measurements in ``partial`` are late; the desired goal never is
     :param drop: probability that a measurement is lost, and the last one shown again
-    :param kwargs: of the gymnasium-robotics environment, such as ``reward_type``, but for those that change its observation
-    :raises ValueError: if an argument is unknown, or is for another kind of task
+    :param kwargs: keyword arguments of the gymnasium-robotics environment, such as ``reward_type``, except those that change
+        its observation
+    :return: environment with ``partial`` and ``privileged``
+    :raises ValueError: if an argument is wrong, or is for another kind of task
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
@@ -264,13 +268,13 @@ def make_robotics(
 
 
 def _both(first: Selection, second: Selection) -> Selection:
-    """Each entry's indices in their order; of entries that both have, none is taken whole."""
+    """Union of two selections, each entry's indices in ascending order; both may share an entry if neither takes it whole."""
     shared = {key: tuple(sorted((*(first[key] or ()), *(second[key] or ())))) for key in set(first) & set(second)}
     return {**first, **second, **shared}
 
 
 def _import_robotics() -> None:
-    """Register gymnasium-robotics's environments, and have its joints' types compared as numbers: see :class:`_ByNumber`."""
+    """Register gymnasium-robotics's environments, and have it compare joints' types as numbers, by :class:`_ByNumber`."""
     import gymnasium_robotics  # noqa: F401
     from gymnasium_robotics.utils import mujoco_utils
 
@@ -280,10 +284,12 @@ def _import_robotics() -> None:
 
 class _ByNumber:
     """
-    MuJoCo, but that ``mjtJoint``'s members are numbers: gymnasium-robotics looks for an element of ``model.jnt_type`` among
-    them, which MuJoCo 3.12 and later find unequal to every one of its own.  It takes the name's place in that module alone.
+    MuJoCo's module, in which the members of ``mjtJoint`` are numbers.
 
-    :param mujoco: the module
+    gymnasium-robotics looks for an element of ``model.jnt_type`` among these members, and in MuJoCo 3.12 and later such an
+    element equals none of them.  This object takes the place of ``mujoco`` in ``gymnasium_robotics.utils.mujoco_utils`` alone.
+
+    :param mujoco: MuJoCo's module
     """
 
     def __init__(self, mujoco: ModuleType):
@@ -295,13 +301,13 @@ class _ByNumber:
         return getattr(self._mujoco, name)
 
 
-#: Id -> how gymnasium makes it, with its time limit
+#: Id -> arguments of its registration, with its time limit
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     f"sb3_gac/{task}-v{found.env_id.rpartition('-v')[2]}": {
         "entry_point": f"{__name__}:make_robotics",
         "max_episode_steps": found.max_episode_steps,
         "kwargs": {"task": task},
-        "disable_env_checker": True,  # which would look at every step, and is asked in tests
+        "disable_env_checker": True,  # the checker would look at every step; tests run it
         "shapes": {name: (size,) for name, size in zip((PARTIAL, PRIVILEGED, "action"), found.sizes, strict=True)},
         "whole_state": False,
     }

@@ -10,16 +10,16 @@ from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
 from sb3_gac.envs.wrappers import Observation
 
 LISTEN = 2
-_NOTHING = 2  # heard, beside the left door and the right one
+_NOTHING = 2  # no door was heard; 0 is the left door, 1 the right one
 
 
 class TigerDoor(gym.Env):
     """
-    One of two doors pays 1, the other nothing, and either ends the episode.
+    A task in which one of two doors pays 1 and the other nothing; opening either ends the episode.
 
-    Actions are left, right and listen, which costs 0.1 and tells the learner the door, once and for all. ``partial`` is what
-    was heard (left, right, nothing), ``privileged`` the paying door and what was heard, one-hot each. For who does not know
-    the door, to listen first is best, and returns 0.9.
+    The actions are left, right and listen. Listening costs 0.1 and tells the learner the paying door, once and for all.
+    ``partial`` is the door that was heard (left, right, none), ``privileged`` the paying door and the door that was heard,
+    each one-hot. Without knowledge of the paying door it is optimal to listen first, with a return of 0.9.
     """
 
     def __init__(self) -> None:
@@ -31,8 +31,8 @@ class TigerDoor(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """
-        :param seed: of the doors
-        :param options: not used
+        :param seed: seed of the paying door, ``None`` to go on with the environment's random numbers
+        :param options: unused
         :return: observation, info
         """
         super().reset(seed=seed)
@@ -51,13 +51,15 @@ class TigerDoor(gym.Env):
 
     def checkpoint_state(self) -> dict[str, Any]:
         """
-        :return: where the door is, and what was heard
+        :return: the paying door, and the door that was heard
         """
         return {"door": self._door, "heard": self._heard}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """
-        :param state: of :meth:`checkpoint_state`
+        Put the environment back into a state.
+
+        :param state: state that :meth:`checkpoint_state` returned
         """
         self._door, self._heard = state["door"], state["heard"]
 
@@ -66,7 +68,7 @@ class TigerDoor(gym.Env):
         return {PARTIAL: heard, PRIVILEGED: np.concatenate([np.eye(2, dtype=np.float32)[self._door], heard])}
 
 
-#: Id -> how gymnasium makes it; who only listens is cut off
+#: Id -> arguments of its registration; the time limit ends the episodes of a policy that only listens
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "sb3_gac/TigerDoor-v0": {"entry_point": f"{__name__}:TigerDoor", "max_episode_steps": 20}
 }

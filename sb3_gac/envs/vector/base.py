@@ -1,4 +1,4 @@
-"""The base of vectorised environments whose simulator steps all of them in one call."""
+"""The base class of vectorised environments whose simulator steps all of them in one call."""
 
 import time
 from abc import abstractmethod
@@ -24,12 +24,13 @@ Observations = dict[str, np.ndarray]
 
 class BatchStep(NamedTuple):
     """
-    What a simulator returns of a step of its N environments.
+    The results of a simulator's step of its N environments.
 
-    :param observation: after it, before any reset; an array, or arrays by key, each of shape (N, ...)
-    :param rewards: shape (N,)
-    :param terminated: shape (N,), whether the task has ended by itself
-    :param truncated: shape (N,), or ``False``; a time limit of the adapter's own is added to it
+    :param observation: observations after the step, before any reset: an array, or arrays by key, each of shape (N, ...)
+    :param rewards: rewards of the step, shape (N,)
+    :param terminated: whether each episode has terminated, because its task has ended by itself, shape (N,)
+    :param truncated: whether the simulator has truncated each episode, shape (N,), or ``False`` for none;
+        :class:`BatchVecEnv` adds its own time limit
     :param infos: name -> values of shape (N, ...), which the environments' infos get
     """
 
@@ -42,27 +43,28 @@ class BatchStep(NamedTuple):
 
 class BatchVecEnv(VecEnv):
     """
-    Observations of a simulator's batch, split into ``partial`` and ``privileged``, with all that SB3 expects of a ``VecEnv``.
+    SB3's ``VecEnv`` over a simulator that steps a batch, with observations split into ``partial`` and ``privileged``.
 
-    A subclass has :meth:`start`, :meth:`restart` and :meth:`advance`; the rest is here: time limit, new episodes at once and
-    the last observation of the one before (``terminal_observation``), ``TimeLimit.truncated``, returns and lengths in the
-    infos as ``Monitor`` has them, and Gaussian noise on ``partial``, drawn once for each observation by a generator of its
-    own, which ``seed`` seeds: the simulator's random numbers are the same whatever ``noise_std`` is.
+    A subclass has :meth:`start`, :meth:`restart` and :meth:`advance`; the rest is here. A time limit truncates episodes. Where
+    an episode has ended, the next one begins at once; the infos then have the last observation (``terminal_observation``),
+    ``TimeLimit.truncated``, and the episode's return and length as ``Monitor`` has them. Gaussian noise on ``partial`` is
+    drawn once for each observation, by a generator of its own, which ``seed`` seeds. So the simulator's random numbers do not
+    depend on ``noise_std``.
 
-    The environments share one simulator: attributes are those of this object, set for all of them at once.
+    The environments share one simulator. So their attributes are those of this object, set for all of them at once.
 
     :param n_envs: number of environments
     :param observation_space: space of one environment's observation as the simulator gives it: a Box, or a Dict of Boxes
     :param action_space: space of one environment's actions; Box actions are clipped to it
-    :param partial: what of the observation the deployed policy sees: indices or a slice of a Box, keys of a Dict, or a mapping
-        from keys to indices, slices or ``None`` for all
-    :param privileged: what only training sees, in the same form
-    :param time_limit: steps after which an episode is truncated, ``None`` for no limit of the adapter's own
+    :param partial: components that the deployed policy sees: indices or a slice of a Box, keys of a Dict, or a mapping from
+        keys to indices, slices, or ``None`` for a whole entry
+    :param privileged: components that only training sees, in the same form
+    :param time_limit: number of steps after which an episode is truncated, ``None`` if the simulator alone truncates episodes
     :param noise_std: standard deviation of the noise on ``partial``, a number or one per component; 0 for none
-    :raises ValueError: naming the argument that is wrong
+    :raises ValueError: if an argument is wrong; the message names it
     """
 
-    render_mode: str | None = None  # VecEnv.__init__ asks for it
+    render_mode: str | None = None  # VecEnv.__init__ reads this attribute
 
     def __init__(
         self,
@@ -86,57 +88,70 @@ class BatchVecEnv(VecEnv):
         actions = self.action_space
         self._bounds = (actions.low, actions.high) if isinstance(actions, spaces.Box) else None
         self._is_noisy, self._noise = bool((self.noise_std > 0).any()), np.random.default_rng()
-        #: Steps so far, and those after which the episodes began: no array is touched before one may be over its limit
+        #: Steps so far, the step at which each episode began, and the first of these: no array is touched before an episode
+        #: may have reached its time limit
         self._n_steps, self._begun, self._first_begun = 0, np.zeros(self.num_envs, dtype=np.int64), 0
         self._returns = np.zeros(self.num_envs)
         self._has_started, self._created = False, time.time()
         self._actions: np.ndarray | None = None
 
-    # --- the simulator's --------------------------------------------------------------------------------------------
+    # --- interface to the simulator ---------------------------------------------------------------------------------
 
     @abstractmethod
     def start(self, seeds: Sequence[int]) -> SimulatorObservation:
         """
-        New episodes in all environments, whose random numbers depend on nothing but the seeds.
+        Begin new episodes in all environments, whose random numbers depend on the seeds alone.
 
-        :param seeds: one for each environment
-        :return: first observations, of shape (N, ...)
+        :param seeds: seeds, one for each environment
+        :return: first observations: an array, or arrays by key, each of shape (N, ...)
         """
 
     @abstractmethod
     def restart(self, indices: np.ndarray) -> SimulatorObservation:
         """
-        New episodes in some environments, whose random numbers go on; the others stay where they are.
+        Begin new episodes in some environments, whose random numbers go on; the others stay where they are.
 
-        :param indices: of those environments, ascending
-        :return: their first observations, of shape (number of indices, ...), in that order
+        :param indices: indices of these environments, ascending
+        :return: first observations of these environments, in that order: an array, or arrays by key, each of shape
+            (number of indices, ...)
         """
 
     @abstractmethod
     def advance(self, actions: np.ndarray) -> BatchStep:
         """
-        :param actions: one for each environment, within the action space
+        Step all environments.
+
+        :param actions: actions within the action space, one for each environment
+        :return: results of the step
         """
 
     def simulator_state(self) -> dict[str, Any]:
         """
-        :return: all of the simulator that the next steps depend on: numbers, strings, lists, dicts, arrays and generators
-        :raises NotRestorableError: saying why it can't be had
+        Write down the state of the simulator.
+
+        :return: all of the simulator's state that the next steps depend on: numbers, strings, lists, dicts, arrays and
+            generators
+        :raises NotRestorableError: if the simulator's state can't be read; the message says why
         """
         raise NotRestorableError(f"{type(self).__name__} can't write down its simulator's state")
 
     def restore_simulator_state(self, state: dict[str, Any]) -> None:
         """
-        :param state: of :meth:`simulator_state`
+        Put the simulator back into a state.
+
+        :param state: state that :meth:`simulator_state` returned
+        :raises NotRestorableError: if the simulator can't be put back
         """
         raise NotRestorableError(f"{type(self).__name__} can't put back its simulator's state")
 
-    # --- SB3's ------------------------------------------------------------------------------------------------------
+    # --- interface of VecEnv ----------------------------------------------------------------------------------------
 
     def reset(self) -> Observations:
         """
-        :return: first observations of new episodes, by the seeds of :meth:`seed` if it was called since the last reset
-        :raises ValueError: if there are options
+        Begin new episodes in all environments.
+
+        :return: first observations of new episodes, seeded if :meth:`seed` was called since the last reset
+        :raises ValueError: if :meth:`set_options` was given options, which this class does not take
         """
         if any(self._options):
             raise ValueError(f"{type(self).__name__} takes no options of a reset, got {self._options}.")
@@ -154,8 +169,10 @@ class BatchVecEnv(VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """
-        :param actions: one for each environment
-        :raises RuntimeError: before the first reset
+        Keep the actions of the next step, clipped to the action space.
+
+        :param actions: actions, one for each environment
+        :raises RuntimeError: if the environments were not reset yet
         """
         if not self._has_started:
             raise RuntimeError(f"{type(self).__name__} must be reset before its first step.")
@@ -165,7 +182,9 @@ class BatchVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """
-        :return: observations, after an episode's end those of the next one, rewards, dones, infos
+        Step all environments by the actions of :meth:`step_async`.
+
+        :return: observations, rewards, dones, infos; where an episode has ended, the observation is the first one of the next
         """
         assert self._actions is not None
         raw, rewards, terminated, truncated, values = self.advance(self._actions)
@@ -186,7 +205,7 @@ class BatchVecEnv(VecEnv):
     def _end_episodes(
         self, ended: np.ndarray, is_cut: np.ndarray, observation: Observations, infos: list[dict[str, Any]]
     ) -> None:
-        """Put their last observations into the infos, and the first ones of the next episodes in their place."""
+        """Put the last observations of ended episodes into the infos, and the first ones of the next in their place."""
         seconds = round(time.time() - self._created, 6)
         for index in ended.tolist():
             infos[index]["TimeLimit.truncated"] = bool(is_cut[index])
@@ -211,22 +230,26 @@ class BatchVecEnv(VecEnv):
         return {PARTIAL: partial, PRIVILEGED: self._privileged.of(raw)}
 
     def close(self) -> None:
-        """Nothing to be freed."""
+        """Free nothing; subclasses close their simulators."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """
-        :param attr_name: of an attribute of this object
-        :param indices: of environments
-        :return: the attribute, for each of them
+        Read an attribute of this object.
+
+        :param attr_name: name of an attribute of this object
+        :param indices: indices of environments, ``None`` for all
+        :return: value of the attribute, once for each of these environments
         """
         return [getattr(self, attr_name)] * len(self._list_of(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """
-        :param attr_name: of an attribute of this object
-        :param value: for all environments
-        :param indices: of environments, all of them
-        :raises ValueError: if they are some of the environments
+        Set an attribute of this object, for all environments at once.
+
+        :param attr_name: name of the attribute
+        :param value: value for all environments
+        :param indices: indices of all environments, or ``None``
+        :raises ValueError: if ``indices`` leaves environments out
         """
         if set(self._list_of(indices)) != set(range(self.num_envs)):
             raise ValueError(f"{attr_name} is one for all environments of {type(self).__name__}: leave indices out.")
@@ -236,18 +259,20 @@ class BatchVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """
-        :param method_name: of a method of this object, which is called once
-        :param indices: of environments
-        :return: what it returned, for each of them
+        Call a method of this object.
+
+        :param method_name: name of a method of this object, which is called once, with the further arguments
+        :param indices: indices of environments, ``None`` for all
+        :return: result of the method, once for each of these environments
         """
         result = getattr(self, method_name)(*method_args, **method_kwargs)
         return [result] * len(self._list_of(indices))
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """
-        :param wrapper_class: of a wrapper
-        :param indices: of environments
-        :return: for each of them, whether this is ``Monitor``, whose infos they have
+        :param wrapper_class: class of a wrapper
+        :param indices: indices of environments, ``None`` for all
+        :return: for each of these environments, whether the class is ``Monitor``, whose infos they have
         """
         return [wrapper_class is Monitor] * len(self._list_of(indices))
 
@@ -259,8 +284,8 @@ class BatchVecEnv(VecEnv):
 
     def checkpoint_state(self) -> dict[str, Any]:
         """
-        :return: what the next steps depend on
-        :raises NotRestorableError: if the simulator's state can't be had
+        :return: state that the next steps depend on: the simulator's, the noise's, and returns and lengths of the episodes
+        :raises NotRestorableError: if the simulator's state can't be read
         """
         lengths = self._n_steps - self._begun
         own = {"lengths": lengths, "returns": self._returns, "noise": self._noise, "has_started": self._has_started}
@@ -268,7 +293,9 @@ class BatchVecEnv(VecEnv):
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """
-        :param state: of :meth:`checkpoint_state`
+        Put the environments back into a state.
+
+        :param state: state that :meth:`checkpoint_state` returned
         :raises NotRestorableError: if the simulator can't be put back
         """
         self.restore_simulator_state(state["simulator"])

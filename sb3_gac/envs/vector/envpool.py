@@ -1,8 +1,8 @@
 """
-Any task of EnvPool (extra ``envpool``): C++ simulators that step a batch on the CPU.
+The tasks of EnvPool (extra ``envpool``): C++ simulators that step a batch on the CPU.
 
 EnvPool has MuJoCo Playground, DeepMind control, gymnasium's MuJoCo, MetaWorld and MyoSuite among others;
-``envpool.list_all_envs()`` names them.
+``envpool.list_all_envs()`` names all tasks.
 """
 
 import os
@@ -21,32 +21,33 @@ from sb3_gac.envs.suites.extras import import_extra
 from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv, SimulatorObservation
 
 _OURS = ("env_type", "num_envs", "batch_size", "seed", "env_seed", "max_episode_steps", "gym_reset_return_info")
-_LARGEST = 2**31 - 1  # seeds and limits are 32-bit integers with a sign there
+_LARGEST = 2**31 - 1  # EnvPool's seeds and time limits are signed 32-bit integers
 
 
 class EnvPoolVecEnv(BatchVecEnv):
     """
     A task of EnvPool as ``Dict(partial, privileged)``.
 
-    EnvPool seeds a pool when it is built, so that happens at the first reset, and again at each reset after :meth:`seed`: a
-    robot takes up to a second for each environment. It would begin a new episode with the step after an end, whose action it
-    ignores; here the new episode begins at once. The time limit is counted here, so that an end of the task in its last step
-    is known for one.
+    EnvPool seeds a pool when the pool is built. So the pool is built at the first reset, and again at each reset after
+    :meth:`seed`; building a robot's simulators takes up to a second for each environment. EnvPool would begin a new episode in
+    the step after an episode's end, and ignore that step's action; here the new episode begins at once. The time limit is
+    counted here, so that a termination in an episode's last step is told apart from a truncation.
 
     :param task_id: EnvPool's name of the task, such as "MuJoCoPlayground/Go1JoystickFlatTerrain-v1"
     :param n_envs: number of environments
-    :param partial: what of the observation the deployed policy sees: indices or a slice of a flat one, keys of a dict, or a
-        mapping from keys to indices, slices or ``None`` for all
-    :param privileged: what only training sees, in the same form
-    :param time_limit: steps after which an episode is truncated, by default the task's own
-    :param noise_std: standard deviation of Gaussian noise on ``partial``, beside any that the task has itself
-    :param num_threads: of the pool, by default as many as there are cores that torch's threads leave, at least one. Both wait
-        by spinning: where they are more than the cores, each step and each gradient step takes many times as long
-        (``torch.set_num_threads``)
-    :param info_keys: names in EnvPool's infos that the infos here are to have, such as "success"
-    :param kwargs: further arguments of EnvPool, such as ``noise_level``
-    :raises ValueError: if there is no such task, or naming the argument that is wrong
-    :raises ImportError: if EnvPool is not installed, saying how to
+    :param partial: components that the deployed policy sees: indices or a slice of a flat observation, keys of a dict, or a
+        mapping from keys to indices, slices, or ``None`` for a whole entry
+    :param privileged: components that only training sees, in the same form
+    :param time_limit: number of steps after which an episode is truncated, ``None`` for the task's own time limit
+    :param noise_std: standard deviation of Gaussian noise on ``partial``, beside any noise of the task itself: a number, or
+        one per component
+    :param num_threads: number of the pool's threads, ``None`` for as many as torch's threads leave cores free, at least one
+        and at most ``n_envs``. The threads of both wait by spinning: if they are more than the cores, each step and each
+        gradient step takes many times as long (``torch.set_num_threads``)
+    :param info_keys: names of values in EnvPool's infos that the infos here get as well, such as "success"
+    :param kwargs: further keyword arguments for EnvPool's task, such as ``noise_level``
+    :raises ValueError: if there is no such task, or another argument is wrong; the message names it
+    :raises ImportError: if EnvPool is not installed; the message says how to install it
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class EnvPoolVecEnv(BatchVecEnv):
         specification = self._specification()
         space = specification.gymnasium_observation_space
         self._observation_keys = list(space.spaces) if isinstance(space, spaces.Dict) else None
-        #: EnvPool's own, from the first reset on
+        #: EnvPool's simulators, ``None`` before the first reset
         self.pool: Any = None
         super().__init__(
             n_envs,
@@ -81,7 +82,7 @@ class EnvPoolVecEnv(BatchVecEnv):
         self.num_threads = _threads(num_threads, self.num_envs)
 
     def _specification(self) -> Any:
-        """The task's, without its simulators."""
+        """EnvPool's specification of the task, for which no simulator is built."""
         if reserved := sorted(set(self._kwargs) & set(_OURS)):
             raise ValueError(f"{reserved} are set by EnvPoolVecEnv: it takes n_envs, time_limit, and seeds by seed().")
         known = self._envpool.list_all_envs()
@@ -91,9 +92,9 @@ class EnvPoolVecEnv(BatchVecEnv):
         return self._envpool.make_spec(self.task_id, **self._kwargs)
 
     def start(self, seeds: Sequence[int]) -> SimulatorObservation:
-        """See :meth:`BatchVecEnv.start`."""
+        """Build a pool with these seeds and begin its episodes, as :meth:`BatchVecEnv.start` requires."""
         assert self.time_limit is not None
-        self.pool = None  # the one before need not be there beside it
+        self.pool = None  # frees the former pool before the new one is built
         self.pool = self._envpool.make(
             self.task_id,
             env_type="gymnasium",
@@ -106,14 +107,14 @@ class EnvPoolVecEnv(BatchVecEnv):
         return self.restart(np.arange(self.num_envs))
 
     def restart(self, indices: np.ndarray) -> SimulatorObservation:
-        """See :meth:`BatchVecEnv.restart`."""
+        """Begin new episodes in some environments, as :meth:`BatchVecEnv.restart` requires."""
         observation, info = self.pool.reset(indices.astype(np.int32))
         return _in_order(observation, np.argsort(info["env_id"]))
 
     def advance(self, actions: np.ndarray) -> BatchStep:
-        """See :meth:`BatchVecEnv.advance`."""
+        """Step all environments, as :meth:`BatchVecEnv.advance` requires."""
         self.pool.send(actions)
-        # What recv() does beyond this is to put all infos into nested dicts, which takes as long as a small robot's step
+        # recv() would also put all infos into nested dicts, which takes as long as a small robot's step
         state = dict(zip(self.pool._state_keys, self.pool._recv(), strict=True))
         done, truncated = state["done"], state["trunc"]
         infos = {name: self._info(state, name) for name in self.info_keys}
@@ -132,6 +133,8 @@ class EnvPoolVecEnv(BatchVecEnv):
 
     def simulator_state(self) -> dict[str, Any]:
         """
+        Refuse, since EnvPool's simulators have no state that can be read.
+
         :raises NotRestorableError: always
         """
         raise NotRestorableError("EnvPool has no way to read its simulators' state or to put it back")
@@ -142,7 +145,7 @@ class EnvPoolVecEnv(BatchVecEnv):
 
 
 def _in_order(observation: Any, order: np.ndarray) -> SimulatorObservation:
-    """Rows in another order, of an array or of nested dicts of arrays."""
+    """Reorder the rows of an array, or of nested dicts of arrays."""
     if isinstance(observation, Mapping):
         return {key: _in_order(value, order) for key, value in observation.items()}  # type: ignore[misc]
     return observation[order]

@@ -1,4 +1,4 @@
-"""A simulator of many environments with observations by group, one of them for the critic, as Isaac Lab's are."""
+"""Simulators of many environments whose observations are groups, one of them for the critic, as in Isaac Lab."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,28 +14,28 @@ Groups = dict[str, np.ndarray]
 
 class GroupsVecEnv(BatchVecEnv):
     """
-    A simulator of N environments, whose observation is ``{"policy": ..., "critic": ...}``, as SB3's ``VecEnv``::
+    SB3's ``VecEnv`` over a simulator of N environments whose observation is ``{"policy": ..., "critic": ...}``::
 
         env = GroupsVecEnv(gym.make("Isaac-Velocity-Rough-Anymal-D-v0", cfg=cfg))
         model = GAC("MultiInputPolicy", env, role_keys={"critic": ["privileged"]})
 
-    It is asked for ``num_envs``, ``single_observation_space`` (a Dict of Boxes), ``single_action_space``, ``reset(seed=...)``,
-    which returns (groups, extras), and ``step(actions)``, which returns (groups, rewards, terminated, truncated, extras), with
-    tensors of any device, or arrays, of shape (N, ...).
+    The simulator has ``num_envs``, ``single_observation_space`` (a Dict of Boxes) and ``single_action_space``.  Its
+    ``reset(seed=...)`` returns (groups, extras), and its ``step(actions)`` returns (groups, rewards, terminated, truncated,
+    extras), as tensors of any device or as arrays, of shape (N, ...).
 
-    Such a simulator resets by itself the environments whose episodes have ended, and shows the first observation of the next
-    ones.  Where it does not say what the last one was (``final_key``), the observation before it stands in.  Nothing is lost
-    where episodes terminate, since nothing is expected after that.  At a time limit, the value of what follows is then that of
-    one step earlier.  Episodes can't be taken up again from a checkpoint.
+    Such a simulator itself resets the environments whose episodes have ended, and returns the first observations of the next
+    episodes.  If it does not report an episode's last observation (``final_key``), the observation before the last one stands
+    in.  Nothing is lost at a termination, after which no return is expected.  At a time limit, the value to bootstrap from is
+    that of one step earlier.  A checkpoint can't take up episodes again.
 
-    :param simulator: with the above, wrapped or not
+    :param simulator: simulator with these attributes and methods, wrapped or not
     :param partial: groups that the deployed policy sees, or a mapping from groups to indices into them
     :param privileged: groups that only training sees, in the same form
-    :param max_action: bound of Box actions where the simulator's have none
-    :param final_key: of ``extras``, under which there are the groups of the last observations, of shape (N, ...); rows count
-        where an episode has ended
+    :param max_action: bound of Box actions where the simulator's action space has none
+    :param final_key: key in ``extras`` of the groups of last observations, of shape (N, ...), which are read in the rows of
+        ended episodes; ``None`` if the simulator does not report them
     :param noise_std: standard deviation of noise on ``partial``, a number or one per component; 0 for none
-    :raises ValueError: naming the argument or the group that is wrong
+    :raises ValueError: if an argument or a group is wrong; the message names it
     """
 
     def __init__(
@@ -66,15 +66,19 @@ class GroupsVecEnv(BatchVecEnv):
 
     def start(self, seeds: Sequence[int]) -> Groups:
         """
-        :param seeds: the simulator has one, the first
-        :return: first observations
+        Reset the simulator by a seed.
+
+        :param seeds: seeds, one for each environment; the simulator takes the first for all of them
+        :return: first observations by group, each of shape (N, ...)
         """
         return self._reset(seed=seeds[0])
 
     def restart(self, indices: np.ndarray) -> Groups:
         """
-        :param indices: of all environments, or of those whose episodes have ended, which the simulator has reset
-        :return: their first observations
+        Begin new episodes; where episodes have ended, the simulator has done so already.
+
+        :param indices: indices of all environments, or of those whose episodes have ended
+        :return: first observations of these environments by group
         """
         if not self._has_ended[indices].all():
             return self._reset()
@@ -82,7 +86,10 @@ class GroupsVecEnv(BatchVecEnv):
 
     def advance(self, actions: np.ndarray) -> BatchStep:
         """
-        :param actions: one for each environment, within the action space
+        Step all environments.
+
+        :param actions: actions within the action space, one for each environment
+        :return: results of the step, with the last observations of episodes that have ended
         """
         before = self._shown
         given = actions if self._like is None else self._like.new_tensor(actions)
@@ -104,7 +111,7 @@ class GroupsVecEnv(BatchVecEnv):
     def _reset(self, **given: Any) -> Groups:
         groups, self.extras = self.simulator.reset(**given)
         first = next(iter(groups.values()))
-        self._like = first if hasattr(first, "new_tensor") else None  # actions go where observations come from
+        self._like = first if hasattr(first, "new_tensor") else None  # actions go to the device of the observations
         self._shown, self._has_ended = _in_arrays(groups), np.zeros(self.num_envs, dtype=bool)
         return self._shown
 
@@ -129,10 +136,10 @@ def _bounded(space: spaces.Space, bound: float) -> spaces.Space:
 
 
 def _in_arrays(groups: Mapping[str, Any]) -> Groups:
-    """Copies: the simulator may write into its own again."""
+    """Copy all groups into arrays: the simulator may write into its own tensors again."""
     return {name: np.array(_array(values)) for name, values in groups.items()}
 
 
 def _array(values: Any) -> np.ndarray:
-    """Of a tensor on any device, or of what is like an array."""
+    """Make an array of a tensor on any device, or of anything like an array."""
     return np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)

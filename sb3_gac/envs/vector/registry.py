@@ -10,13 +10,15 @@ from sb3_gac.envs.suites import batch_factory, is_batched
 
 def make_vec(env_id: str, n_envs: int = 1, seed: int | None = None, **kwargs: Any) -> VecEnv:
     """
-    :param env_id: id of a registered environment; those of suites whose simulator steps a batch become one simulator of
-        ``n_envs`` environments
-    :param n_envs: side by side
-    :param seed: seed of the first environment, the others have the next ones; ``None`` for a random one
-    :param kwargs: arguments of the environment, such as ``noise_std``
-    :return: environments whose infos have returns and lengths of episodes
-    :raises ImportError: if the simulator is not installed, saying how to
+    Make vectorised environments by id.
+
+    :param env_id: id of a registered environment; where its simulator steps a batch, one simulator has all ``n_envs``
+        environments
+    :param n_envs: number of environments side by side
+    :param seed: seed of the first environment, while the others have the next ones; ``None`` for a random seed
+    :param kwargs: keyword arguments of the environment, such as ``noise_std``
+    :return: vectorised environments whose infos have returns and lengths of episodes
+    :raises ImportError: if the simulator is not installed; the message says how to install it
     :raises ValueError: if ``delay`` or ``drop`` is asked of a simulator that steps a batch
     """
     if not is_batched(env_id):

@@ -1,4 +1,4 @@
-"""One environment of a simulator that steps many, as gymnasium knows environments."""
+"""One environment of a simulator that steps many, as a ``gymnasium.Env``."""
 
 from typing import Any
 
@@ -10,12 +10,13 @@ from sb3_gac.envs.suites import batch_factory
 
 class SingleEnv(gym.Env):
     """
-    A ``gymnasium.Env`` over vectorised environments of which there is one.
+    A ``gymnasium.Env`` over a vectorised environment that has one environment alone.
 
-    Those begin the next episode when one ends; its first observation is kept for the reset that follows.
+    A vectorised environment begins the next episode when one ends. The first observation of that next episode is kept for the
+    reset that follows.
 
-    :param vec_env: with one environment, whose observation is a Dict
-    :raises ValueError: if there are more
+    :param vec_env: vectorised environment of one, with a Dict observation
+    :raises ValueError: if it has more than one environment
     """
 
     def __init__(self, vec_env: Any):
@@ -29,8 +30,10 @@ class SingleEnv(gym.Env):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """
-        :param seed: of the simulator and of the noise
-        :param options: none
+        Begin a new episode.
+
+        :param seed: seed of the simulator and of the noise, ``None`` to go on with their random numbers
+        :param options: options of the vectorised environment's reset; a simulator that steps a batch takes none
         :return: observation, info
         """
         super().reset(seed=seed)
@@ -45,7 +48,7 @@ class SingleEnv(gym.Env):
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """
-        :param action: within the action space
+        :param action: action within the action space
         :return: observation, reward, terminated, truncated, info
         :raises RuntimeError: if the episode has ended
         """
@@ -54,7 +57,7 @@ class SingleEnv(gym.Env):
         observations, rewards, dones, (info,) = self.vec_env.step(np.asarray(action)[None])
         observation = _only(observations)
         truncated = info.pop("TimeLimit.truncated")
-        info.pop("episode", None)  # Monitor's, which is around this environment if it is wanted
+        info.pop("episode", None)  # a Monitor around this environment adds its own
         if dones[0]:
             self._next_first, observation = observation, info.pop("terminal_observation")
         return observation, float(rewards[0]), bool(dones[0]) and not truncated, truncated, info
@@ -64,11 +67,17 @@ class SingleEnv(gym.Env):
         self.vec_env.close()
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """See :mod:`sb3_gac.envs.state`."""
+        """
+        :return: state of the vectorised environment and the kept first observation, for :mod:`sb3_gac.envs.state`
+        """
         return {"vec_env": self.vec_env.checkpoint_state(), "next_first": self._next_first}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """See :mod:`sb3_gac.envs.state`."""
+        """
+        Put the environment back into a state.
+
+        :param state: state that :meth:`checkpoint_state` returned
+        """
         self.vec_env.restore_checkpoint_state(state["vec_env"])
         self._next_first = state["next_first"]
 
@@ -79,8 +88,10 @@ def _only(observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def make_single(env_id: str, **kwargs: Any) -> gym.Env:
     """
-    :param env_id: registered, of a suite whose simulator steps a batch
-    :param kwargs: of the suite's vectorised environments
+    Make one environment of a suite whose simulator steps a batch.
+
+    :param env_id: id of a registered environment whose simulator steps a batch
+    :param kwargs: keyword arguments for the suite's vectorised environments
     :return: one environment, with its time limit
     """
     factory, of_task = batch_factory(env_id)
