@@ -10,7 +10,7 @@ The command reads ``halfcheetah.csv`` and ``halfcheetah.json``. Beside them, it 
 import argparse
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +41,13 @@ from matplotlib import pyplot as plt
 FORMATS = ("png", "pdf", "svg")
 
 
-def draw(tidy: pd.DataFrame, paths: Sequence[Path]) -> None:
+def draw(tidy: pd.DataFrame, paths: Sequence[Path], to_run: Collection[str] | None = None) -> None:
     """
     Draw the figure: tasks across, noises down; the learner's mean with its interval, and the guider's mean in dashes.
 
     :param tidy: aggregated evaluations
     :param paths: files of the figure; a suffix names the file's format
+    :param to_run: names of the suite's runs that are not made yet; ``None`` where they are not known
     """
     tasks, noises, algorithms = grid(tidy)
     size = (4.2 * len(tasks), 3.0 * len(noises))
@@ -67,7 +68,7 @@ def draw(tidy: pd.DataFrame, paths: Sequence[Path]) -> None:
                     axis.plot(guider.index, guider["mean"], color=color, linestyle="--", linewidth=1)
             if not cell.empty:
                 axis.set_ylim(returns_range(cell))
-            wanted = is_wanted(tidy, task, noise)
+            wanted = is_wanted(tidy, task, noise, to_run)
             axis.set(title=title_of(task, noise) if wanted else "", xlabel=steps_label(tidy), ylabel=RETURN)
             if cell.empty:
                 axis.set_axis_off()
@@ -152,7 +153,7 @@ def main() -> None:
     tidy = read_tidy(options.results.with_suffix(".csv"))
     tidy = tidy.drop(columns=NEEDED, errors="ignore") if options.own_steps else with_needed_steps(tidy)
     results = json.loads(options.results.with_suffix(".json").read_text())
-    draw(tidy, [options.results.with_suffix(f".{suffix}") for suffix in options.formats])
+    draw(tidy, [options.results.with_suffix(f".{suffix}") for suffix in options.formats], results.get("still_to_run"))
     runs = os.path.relpath(options.runs, options.results.parent)
     options.results.with_suffix(".html").write_text(page(tidy, results, options.results.stem, runs))
     print(f"{cells_table(results['cells'])}\n\n{overall_table(results)}")

@@ -26,7 +26,7 @@ def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> 
     :return: HTML of the page, which needs no other file
     """
     seconds = {name: run["seconds"] for name, run in results["runs"].items() if run.get("seconds")}
-    drawn = plots(tidy, seconds, normalised_returns(results))
+    drawn = plots(tidy, seconds, normalised_returns(results), results.get("still_to_run"))
     short = "".join(f"<li>{html.escape(text)}</li>" for text in in_short(results))
     body = (
         f"<h1>{html.escape(title)}</h1><p>{html.escape(what_was_compared(results))}</p>"

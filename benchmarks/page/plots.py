@@ -1,6 +1,6 @@
 """Interactive plots of a suite's results, whose curves can be switched off."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -66,14 +66,27 @@ def title_of(task: str, noise: float) -> str:
     return task if noise == NO_NOISE else f"{task}, noise {noise:g}"
 
 
-def is_wanted(tidy: pd.DataFrame, task: str, noise: float) -> bool:
+def folder_of(task: str, noise: float) -> str:
+    """
+    :param task: title of a cell's task
+    :param noise: standard deviation of the cell's sensor noise, or ``NO_NOISE``
+    :return: folder of the cell's runs, a part of their names
+    """
+    return task if noise == NO_NOISE else f"{task}-noise{noise:g}"
+
+
+def is_wanted(tidy: pd.DataFrame, task: str, noise: float, to_run: Collection[str] | None = None) -> bool:
     """
     :param tidy: aggregated evaluations
     :param task: title of the cell's task
     :param noise: standard deviation of the cell's sensor noise, or ``NO_NOISE``
-    :return: whether such a cell exists or could exist; a figure of tasks with and without sensor noise has places for other
-        cells too
+    :param to_run: names of the suite's runs that are not made yet; ``None`` where they are not known
+    :return: whether such a cell exists or is still to run; a figure of tasks by noises has places for other cells too
     """
+    if ((tidy.task == task) & (tidy.noise == noise)).any():
+        return True
+    if to_run is not None:
+        return any(f"/{folder_of(task, noise)}/" in name for name in to_run)
     without = (tidy[tidy.task == task].noise == NO_NOISE).unique()
     return (noise == NO_NOISE) in without
 
@@ -153,7 +166,12 @@ def _told(group: pd.DataFrame, learner: pd.DataFrame, color: str) -> dict[str, A
 
 
 def in_cells(
-    tidy: pd.DataFrame, lines_of: Lines, y_title: str, x_title: str, one_column: bool = False
+    tidy: pd.DataFrame,
+    lines_of: Lines,
+    y_title: str,
+    x_title: str,
+    one_column: bool = False,
+    to_run: Collection[str] | None = None,
 ) -> graph_objects.Figure:
     """
     :param tidy: aggregated evaluations
@@ -161,10 +179,11 @@ def in_cells(
     :param y_title: title of all vertical axes
     :param x_title: title of all horizontal axes
     :param one_column: whether cells are below each other; otherwise tasks are across and noises down
+    :param to_run: names of runs that are not made yet, see :func:`is_wanted`
     :return: figure with the curves of each cell; a click on a name switches an algorithm off in all cells
     """
     tasks, noises, algorithms = grid(tidy)
-    cells = {(task, noise): is_wanted(tidy, task, noise) for noise in noises for task in tasks}
+    cells = {(task, noise): is_wanted(tidy, task, noise, to_run) for noise in noises for task in tasks}
     titles = [title_of(*cell) if wanted else "" for cell, wanted in cells.items()]
     columns = 1 if one_column else len(tasks)
     rows = len(cells) // columns
@@ -230,13 +249,14 @@ def _frame(rows: int) -> dict[str, Any]:
     }
 
 
-def interactive(tidy: pd.DataFrame, one_column: bool = False) -> graph_objects.Figure:
+def interactive(tidy: pd.DataFrame, one_column: bool = False, to_run: Collection[str] | None = None) -> graph_objects.Figure:
     """
     :param tidy: aggregated evaluations
     :param one_column: whether cells are below each other, see :func:`in_cells`
+    :param to_run: names of runs that are not made yet, see :func:`is_wanted`
     :return: figure of the returns over environment steps
     """
-    return in_cells(tidy, algorithm_lines, RETURN, steps_label(tidy), one_column)
+    return in_cells(tidy, algorithm_lines, RETURN, steps_label(tidy), one_column, to_run)
 
 
 def _mean_line(column: str, group: pd.DataFrame, algorithm: str, color: str) -> list[graph_objects.Scatter]:
@@ -248,30 +268,44 @@ def _mean_line(column: str, group: pd.DataFrame, algorithm: str, color: str) -> 
     return [_line(algorithm, mean.index, mean, algorithm, **line)]
 
 
-def _plot(name: str, tidy: pd.DataFrame, lines_of: Lines, y_title: str, x_title: str, caption: str) -> Plot:
-    wide, narrow = (in_cells(tidy, lines_of, y_title, x_title, one_column) for one_column in (False, True))
+def _plot(
+    name: str,
+    tidy: pd.DataFrame,
+    lines_of: Lines,
+    y_title: str,
+    x_title: str,
+    caption: str,
+    to_run: Collection[str] | None = None,
+) -> Plot:
+    wide, narrow = (in_cells(tidy, lines_of, y_title, x_title, one_column, to_run) for one_column in (False, True))
     return Plot(name, wide, narrow, caption)
 
 
-def plots(tidy: pd.DataFrame, seconds: Mapping[str, float], normalised: pd.DataFrame) -> list[Plot]:
+def plots(
+    tidy: pd.DataFrame,
+    seconds: Mapping[str, float],
+    normalised: pd.DataFrame,
+    to_run: Collection[str] | None = None,
+) -> list[Plot]:
     """
     :param tidy: aggregated evaluations
     :param seconds: run's name -> seconds that the run took; if it is empty, there is no plot over seconds
     :param normalised: table with one row for each run: "algorithm", and the "normalised" final return
+    :param to_run: names of runs that are not made yet, see :func:`is_wanted`
     :return: plots for which there are data, one for each tab
     """
     steps = steps_label(tidy)
-    drawn = [_plot("Returns", tidy, algorithm_lines, RETURN, steps, _RETURNS)]
+    drawn = [_plot("Returns", tidy, algorithm_lines, RETURN, steps, _RETURNS, to_run)]
     timed = over_seconds(tidy, seconds)
     if not timed.empty:
-        drawn.append(_plot("Returns over seconds", timed, algorithm_lines, RETURN, "seconds of one core", _SECONDS))
+        drawn.append(_plot("Returns over seconds", timed, algorithm_lines, RETURN, "seconds of one core", _SECONDS, to_run))
     if has_guider(tidy):
         gap = tidy.assign(gap=tidy.guider - tidy.learner).dropna(subset="gap")
         lines = partial(_mean_line, "gap")
-        drawn.append(_plot("Guider over learner", gap, lines, "guider's return - learner's", steps, _GAP))
+        drawn.append(_plot("Guider over learner", gap, lines, "guider's return - learner's", steps, _GAP, to_run))
     if {"kl", "target_kl"} <= set(tidy) and tidy.kl.notna().any():
         ratio = tidy.assign(ratio=tidy.kl / tidy.target_kl).dropna(subset="ratio")
-        drawn.append(_plot("KL", ratio, partial(_mean_line, "ratio"), "KL / target_kl", steps, _KL))
+        drawn.append(_plot("KL", ratio, partial(_mean_line, "ratio"), "KL / target_kl", steps, _KL, to_run))
     if not normalised.empty:
         drawn.append(_profile(normalised))
     return drawn
@@ -315,8 +349,7 @@ def over_seconds(tidy: pd.DataFrame, seconds: Mapping[str, float]) -> pd.DataFra
 
 def _of_run(key: Any, seconds: Mapping[str, float]) -> float | None:
     task, noise, algorithm, seed = key
-    cell = task if noise == NO_NOISE else f"{task}-noise{noise:g}"
-    end = f"/{cell}/{algorithm}/seed{seed}"
+    end = f"/{folder_of(task, noise)}/{algorithm}/seed{seed}"
     return next((taken for name, taken in seconds.items() if taken is not None and name.endswith(end)), None)
 
 

@@ -122,6 +122,15 @@ def test_axes_have_names_and_cells_without_runs_say_so():
     assert (left < words.x < right, below < words.y < above) == (True, True)
 
 
+def test_a_cell_that_no_suite_has_is_no_cell_still_to_run():
+    tidy = pd.concat([_tidy(["gac"]), _tidy(["gac"]).query("task == 'Hopper'").assign(noise=0.3)])
+    awaited = ["small-5/Ant-noise0.3/gac/seed0"]
+    for to_run, said in ((awaited, ["not run yet"]), ([], []), (["small-5/Ant-noise0.2/gac/seed0"], [])):
+        notes = [note.text for note in interactive(tidy, to_run=to_run).layout.annotations]
+        assert [text for text in notes if text == "not run yet"] == said
+        assert ("Ant, noise 0.3" in notes) == bool(said), "nor has it a title"
+
+
 def test_algorithms_beyond_the_eighth_are_drawn_in_colors_of_their_own():
     algorithms = [f"algorithm {index}" for index in range(12)]
     assert len(set(palette(algorithms).values())) == 12
