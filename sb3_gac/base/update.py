@@ -288,8 +288,15 @@ def scale_of(norms: Sequence[th.Tensor], max_norm: float | None) -> th.Tensor | 
         return None
     norm = norms[0] if len(norms) == 1 else th.linalg.vector_norm(th.stack(list(norms)))
     scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
-    # A comparison needs no transfer on the CPU, and saves a pass over all gradients where nothing is clipped
-    return None if scale.device.type == "cpu" and not th.compiler.is_compiling() and scale == 1 else scale
+    return None if _is_on_host(scale) and not th.compiler.is_compiling() and scale == 1 else scale
+
+
+def _is_on_host(tensor: th.Tensor) -> bool:
+    """
+    :return: whether a comparison of the tensor needs no transfer. There it saves a pass over all gradients, where none is
+        clipped
+    """
+    return tensor.device.type == "cpu"
 
 
 def _layout(value: Any) -> Iterator[Any]:

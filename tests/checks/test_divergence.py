@@ -109,8 +109,9 @@ def test_observations_are_diagnosed_as_the_networks_see_them(tmp_path):
 
 @pytest.mark.parametrize("cls", [GAC, AsymmetricMPO])
 def test_the_check_costs_no_host_transfer(cls, monkeypatch):
-    """One in a round of gradient steps, that of the metrics."""
+    """One in a round of gradient steps, that of the metrics, where tensors are on another device than the host."""
     model = small_model(cls=cls, learning_starts=1000).learn(64)
+    monkeypatch.setattr("sb3_gac.base.update._is_on_host", lambda tensor: False)
     transfers = []
     for name in ("item", "tolist", "__float__", "__bool__", "cpu", "numpy"):
         original = getattr(th.Tensor, name)
