@@ -183,7 +183,7 @@ def test_steps_of_needed_runs_are_told_apart_and_counted(launched, tmp_path, mon
     pd.testing.assert_frame_equal(benchmarks.aggregate.collect(counted), table, check_dtype=False, check_like=True)
 
     drawn = []
-    monkeypatch.setattr(benchmarks.report, "draw", lambda tidy, path: drawn.append(tidy))
+    monkeypatch.setattr(benchmarks.report, "draw", lambda tidy, paths, to_run: drawn.append(tidy))
     for options in ([], ["--own-steps"]):
         monkeypatch.setattr(sys, "argv", ["report", str(out), *options])
         benchmarks.report.main()
