@@ -53,7 +53,7 @@ def read_schedule(text: str) -> NamedSchedule:
     if kind == "geometric" and not (start > 0 and end > 0):
         raise ValueError(f"{text!r}: a geometric schedule goes from one number above 0 to another.")
     if not 0 < over <= 1:
-        raise ValueError(f"{text!r}: the fraction of training after over is above 0 and at most 1.")
+        raise ValueError(f'{text!r}: the FRACTION in "over FRACTION" must be above 0 and at most 1.')
     return NamedSchedule(kind, start, end, over)
 
 

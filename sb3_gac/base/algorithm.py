@@ -217,7 +217,7 @@ class AsymmetricAlgorithm(
                 self.frozen[name] = load_frozen_policy(source, self.observation_space, self.action_space, self.device, name)
                 if self.frozen[name].trained_normalised and self.get_vec_normalize_env() is None:
                     raise ValueError(
-                        f"{name} learned from observations that VecNormalize normalised, and these are as they are: wrap env "
+                        f"{name} learned from observations that VecNormalize normalised, but env gives raw ones: wrap env "
                         "in VecNormalize.load(<its statistics>, env), or train it without."
                     )
             elif needed:

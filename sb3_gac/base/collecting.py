@@ -99,8 +99,8 @@ class DataCollection(OffPolicyAlgorithm):
             ways = ("raw", "normalised as they were seen")
             wrapper = f"{'no' if held else 'a'} wrapper outside VecNormalize changes them"
             raise ValueError(
-                f"The replay buffer holds observations {ways[held]}, but of these environments it would get them "
-                f"{ways[normalised]}, because {wrapper}: wrap the environments as before, or leave the buffer out."
+                f"The replay buffer holds observations {ways[held]}, but new observations would be {ways[normalised]}, "
+                f"because {wrapper}: wrap the environments as before, or leave the buffer out."
             )
         buffer.holds_normalised = normalised  # type: ignore[attr-defined]
 

@@ -221,8 +221,8 @@ def networks_named(path: Any, given: list[str]) -> Iterator[None]:
         if "loading state_dict" not in str(error):
             raise
         raise ValueError(
-            f"The networks in {path} do not fit those that the arguments make: leave out which of {given} changes networks. "
-            f"{error}"
+            f"The networks in {path} do not fit those that the arguments make: of the arguments {given}, leave out each that "
+            f"changes a network. {error}"
         ) from error
 
 

@@ -38,7 +38,7 @@ class FrozenPolicy(nn.Module):
         self.policy = deepcopy(model.policy)  # because the model itself may go on training
         self.trained_normalised = bool(getattr(model, "trained_normalised", False))
         if isinstance(self.policy, AsymmetricPolicy) and (self.policy.remembers or any(self.policy.rnn_types.values())):
-            raise ValueError(f"{name} has a memory, and it is asked about single transitions: train one without.")
+            raise ValueError(f"{name} has a memory, but is given single transitions: train a {name} without a memory.")
         self.requires_grad_(False)
         self.train(False)
 

@@ -300,7 +300,7 @@ def _decoded_arguments(stored: dict[str, Any], given: dict[str, Any], arrays: Ma
     missing = {name: entry["cannot"] for name, entry in stored.items() if "cannot" in entry and name not in given}
     if missing:
         reasons = "; ".join(f"{name} ({reason})" for name, reason in missing.items())
-        raise ValueError(f"No checkpoint can hold these arguments, pass them to resume() as before: {reasons}.")
+        raise ValueError(f"No checkpoint can hold these arguments, so pass them to resume() as before: {reasons}.")
     return {name: decode(entry["value"], arrays) for name, entry in stored.items() if "cannot" not in entry}
 
 

@@ -116,7 +116,7 @@ class GPOPolicy(AsymmetricPolicy):
         missing = [key for key in self.role_keys["learner"] if key not in self.role_keys["guider"]]
         if missing:
             raise ValueError(
-                f'role_keys["guider"] lacks {missing}: the guider is the learner\'s network, and sees what it sees.'
+                f'role_keys["guider"] lacks {missing}: add them, since the guider reads all that the learner reads.'
             )
         beside = [key for key in self.role_keys["guider"] if key not in self.role_keys["learner"]]
         space = role_space(self.observation_space, self.role_keys["guider"])  # type: ignore[arg-type]

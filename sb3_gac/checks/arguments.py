@@ -177,7 +177,7 @@ def check_device(name: str, value: Any) -> None:
     try:
         th.device("cpu" if value == "auto" else value)
     except (RuntimeError, TypeError):
-        raise ValueError(f'{name} must be "auto", "cpu", "cuda" or another of torch\'s, got {value!r}.') from None
+        raise ValueError(f'{name} must be "auto", "cpu", "cuda" or another device of torch, got {value!r}.') from None
 
 
 def check_train_freq(name: str, value: Any, n_envs: int = 1) -> None:

@@ -29,7 +29,7 @@ class GACWithoutQ(GACShare):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         if self.is_guided:
-            raise ValueError("guidance would do nothing: this learner climbs no critics beside which the KL could weigh.")
+            raise ValueError("guidance would do nothing: the learner of GACWithoutQ climbs no critics. Leave guidance out.")
 
     def _learner_can_train_a_std(self) -> bool:
         return False

@@ -180,11 +180,11 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
             )
         if self.target_kl == "auto" and not all(map(self._make_behaviour().acts, self.returns)):
             raise ValueError(
-                'target_kl="auto" compares episodes of guider and learner, of which one never acts: give each a share, as in '
-                'behaviour={"learner": 0.25}, or give a number for target_kl.'
+                'target_kl="auto" compares episodes of guider and learner, but one of the two never acts: give each a share, '
+                'as in behaviour={"learner": 0.25}, or give a number for target_kl.'
             )
         if self.max_kl is not None and not isinstance(self.action_space, spaces.Box):
-            raise ValueError("max_kl bounds the KL of Gaussians, that is, of Box actions: leave it None.")
+            raise ValueError("max_kl bounds the KL of Gaussians, which only Box actions have: leave max_kl None.")
 
     def _learner_can_train_a_std(self) -> bool:
         return self.learner_entropy

@@ -47,7 +47,7 @@ def check_can_compile() -> None:
     import torch._dynamo.config  # slow to import
 
     if not hasattr(torch._dynamo.config, "trace_autograd_ops") or not hasattr(th.compiler, "skip_all_guards_unsafe"):
-        raise CannotCompileError(f"needs torch 2.13 or later, and this is {th.__version__}", "update it, or leave it False")
+        raise CannotCompileError(f"needs torch 2.13 or later, not {th.__version__}", "update torch, or leave compile False")
 
 
 def missing_compiler(device: th.device) -> str | None:

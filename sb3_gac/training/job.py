@@ -158,7 +158,7 @@ def _save_checkpoint(model: Any, root: Path, notes: dict[str, Any]) -> None:
     try:
         model.save_checkpoint(root, notes=notes)
     except OSError as error:
-        warnings.warn(f"The checkpoint of the end could not be written: {error}", stacklevel=2)
+        warnings.warn(f"The checkpoint at the end of training could not be written: {error}", stacklevel=2)
 
 
 def finish(job: Job, history: list[dict[str, float]], minutes: float) -> None:

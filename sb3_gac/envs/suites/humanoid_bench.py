@@ -199,7 +199,7 @@ def make_humanoid_bench(
     if privileged not in PRIVILEGED_CHOICES:
         raise ValueError(f"privileged must be one of {list(PRIVILEGED_CHOICES)}, got {privileged!r}.")
     if "obs_wrapper" in kwargs:
-        raise ValueError("obs_wrapper would change the observation, of which the split is made.")
+        raise ValueError("obs_wrapper would change the observation, which is then split: leave obs_wrapper out.")
     robot, _, name = task.partition("-")
     env = WithSensors(SeededTask(robot, name, **kwargs))
     seen, hidden = env.groups

@@ -76,7 +76,7 @@ def make_mujoco(
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
     misplacing = sorted(name for name in kwargs if name.endswith("_observation"))
     if misplacing:
-        raise ValueError(f"{misplacing} would change the observation, of which the split is made by position.")
+        raise ValueError(f"{misplacing} would change the observation, which is split by position: leave them out.")
     with _without_deprecation():
         return make_task(TASKS[task], noise_std, privileged, history, delay, drop, **kwargs)
 

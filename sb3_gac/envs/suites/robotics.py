@@ -255,7 +255,7 @@ def make_robotics(
     if goal_entries and not found.has_goals:
         raise ValueError(f"goal_entries=True, but {task} has no goals.")
     if "touch_get_obs" in kwargs:
-        raise ValueError("touch_get_obs would change the observation: touch is the privileged entry, by log(1 + x).")
+        raise ValueError("touch_get_obs would change the observation, whose touch values are privileged: leave it out.")
     env: gym.Env = Robot(found.env_id, goal_entries, **{**found.kwargs, **kwargs})
     if not found.has_goals:
         env = WithSimulatorState(env)

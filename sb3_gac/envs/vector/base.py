@@ -154,7 +154,7 @@ class BatchVecEnv(VecEnv):
         :raises ValueError: if :meth:`set_options` was given options, which this class does not take
         """
         if any(self._options):
-            raise ValueError(f"{type(self).__name__} takes no options of a reset, got {self._options}.")
+            raise ValueError(f"{type(self).__name__} takes no reset options, got {self._options}: do not call set_options().")
         if not self._has_started and self._seeds[0] is None:
             self.seed()
         if self._seeds[0] is None:

@@ -160,7 +160,7 @@ def _threads(given: int | None, n_envs: int) -> int:
     if number + of_torch > cores > 1:
         warnings.warn(
             f"{number} threads of EnvPool and {of_torch} of torch are more than the {cores} cores. Both wait by spinning, so "
-            "that steps and gradient steps take many times as long: call torch.set_num_threads with what num_threads leaves.",
+            "that steps and gradient steps take many times as long: lower num_threads, or call torch.set_num_threads(...).",
             stacklevel=3,
         )
     return number
