@@ -280,6 +280,21 @@ def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
     return rows
 
 
+def read_together(paths: Sequence[Path]) -> pd.DataFrame:
+    """
+    Read several results, such as those of as many steps and of five times as many.
+
+    :param paths: paths of aggregated results, without a suffix
+    :return: aggregated evaluations of all; an algorithm that earlier results have too bears the name of its own results
+    """
+    tables: list[pd.DataFrame] = []
+    for path in paths:
+        tidy = read_tidy(path.with_suffix(".csv"))
+        known = {name for table in tables for name in table.algorithm}
+        tables.append(tidy.assign(algorithm=[f"{name} ({path.name})" if name in known else name for name in tidy.algorithm]))
+    return pd.concat(tables)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """
     Entry point of the command line.
@@ -287,11 +302,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     :param arguments: command-line arguments, by default those of the process
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path, help="path of aggregated results, without a suffix")
+    parser.add_argument("results", type=Path, nargs="+", help="paths of aggregated results, without a suffix")
     parser.add_argument("--reference", default=ASYMMETRIC, help=f"algorithm to compare with (default: {ASYMMETRIC})")
     options = parser.parse_args(arguments)
     head = ["task", "noise", "algorithm", "each seed's end", "mean", "spread", f"over {options.reference}: value, low, high"]
-    print(in_columns(head, ends_table(read_tidy(options.results.with_suffix(".csv")), options.reference)))
+    print(in_columns(head, ends_table(read_together(options.results), options.reference)))
 
 
 if __name__ == "__main__":

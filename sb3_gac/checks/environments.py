@@ -81,6 +81,8 @@ class EnvironmentGuard:
         #: Number of environments that DummyVecEnv, which steps one after the other, has done in the call under way
         self._done = 0
         self._calls = 0
+        #: The guard that counts them: the first one, where several wrappers around the same environments have one each
+        self._counting = self
         self._uses_inside: list[EnvironmentUse] = []
         self._ends = SuspiciousEnds()
         #: Whether returned arrays are new, which is known of SB3's own classes without wrappers
@@ -94,6 +96,7 @@ class EnvironmentGuard:
                 vars(self.base)["_save_obs"] = self.save_obs
                 for index, one in enumerate(self.base.envs):
                     KeepingFinal.of(one).add(self.base, index)
+            self._counting = vars(self.base)["_save_obs"].__self__
         if isinstance(self.base, SubprocVecEnv) and not isinstance(self.base.remotes[0], WatchedPipe):
             self.base.remotes = tuple(map(WatchedPipe, self.base.remotes, self.base.processes))
             self._close = self.base.close
@@ -221,7 +224,7 @@ class EnvironmentGuard:
     def _call(self, method: Callable[..., Any], *args: Any) -> Any:
         if self._failure is not None:
             raise EnvironmentFailedError(self._failure)
-        self._done = 0
+        self._counting._done = 0
         try:
             return method(*args)
         except FAULTS:
@@ -238,13 +241,17 @@ class EnvironmentGuard:
             self._failure = end_processes(self.base)
             return EnvironmentFailedError(self._failure)
         codes = [frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)]
-        if isinstance(self.base, DummyVecEnv) and self._done < self.base.num_envs and set(codes) & set(ONE_AFTER_THE_OTHER):
+        if (
+            isinstance(self.base, DummyVecEnv)
+            and self._counting._done < self.base.num_envs
+            and set(codes) & set(ONE_AFTER_THE_OTHER)
+        ):
             said = described(error)
             if codes[-1] in REWARD_IS_TAKEN and any(words in str(error) for words in NO_NUMBER):
                 said += " Its reward must be a single number, such as float(reward[0])."
             return EnvironmentFailedError(
-                f"Environment {self._done} raised {said} {KEPT} Fix the environment (or call set_env) and continue with "
-                "learn(..., reset_num_timesteps=False)."
+                f"Environment {self._counting._done} raised {said} {KEPT} Fix the environment (or call set_env) and "
+                "continue with learn(..., reset_num_timesteps=False)."
             )
         return self._fault_in_answers() if isinstance(self.base, SubprocVecEnv) else None
 

@@ -30,12 +30,10 @@ from sb3_gac.training.directory import (
 )
 from sb3_gac.training.environments import STATISTICS, find_modules_here, make_envs, normalized
 from sb3_gac.training.evaluation import EVAL_SEED, PartialOnly, UniformActions, evaluate
-from sb3_gac.training.options import algorithm_arguments
+from sb3_gac.training.options import EPISODES_ON_THE_WAY, algorithm_arguments
 from sb3_gac.training.progress import Progress
 
 EVALUATIONS = 10
-#: Number of episodes of an evaluation during training, all at the same time: enough for a curve
-EPISODES_ON_THE_WAY = 5
 
 
 class Job(NamedTuple):

@@ -31,6 +31,8 @@ DEFAULTS: Mapping[str, Any] = {
     "tensorboard": False,
     "runs": Path("runs"),
 }
+#: Most episodes of an evaluation on the way, side by side: enough for a curve
+EPISODES_ON_THE_WAY = 5
 #: Name of the argument by which algorithms take a teacher
 TEACHER = "teacher"
 _COMPILE = {"auto": "auto", "yes": True, "no": False}
@@ -122,7 +124,9 @@ def _add_training(group: Any) -> None:
 
 def _add_results(group: Any) -> None:
     group.add_argument(
-        "--episodes", type=positive, help=f"of the last evaluation (default: {DEFAULTS['episodes']}); those on the way have 5"
+        "--episodes",
+        type=positive,
+        help=f"of the last evaluation (default: {DEFAULTS['episodes']}); those on the way have {EPISODES_ON_THE_WAY}",
     )
     group.add_argument(
         "--tensorboard", action="store_true", default=None, help="log for TensorBoard in the run's directory (default: no)"

@@ -12,6 +12,7 @@ from benchmarks.headroom import (
     in_words,
     main,
     number,
+    read_together,
     recommendation,
     seeds_to_see,
     worth,
@@ -132,6 +133,20 @@ def test_the_ends_of_aggregated_results_by_hand():
     assert first == ["T", "0.1", "sac-asym", "9.00, 11.0", "10.0", "14%", ""]
     low, high = (11 + sign * 4.3027 * math.sqrt(2) for sign in (-1, 1))  # two degrees of freedom, variances 2 and 2
     assert second == ["T", "0.1", "gac", "20.0, 22.0", "21.0", "7%", f"11.0, {number(low)}, {number(high)}"]
+
+
+def test_several_results_are_read_together_and_told_apart(tmp_path):
+    for name, end in (("few", 10.0), ("many", 20.0)):
+        tidy = _tidy({"gac": [end, end + 2], f"of-{name}": [1.0, 2.0]}).assign(noise=0.1)
+        tidy.to_csv(tmp_path / f"{name}.csv", index=False)
+    rows = ends_table(read_together([tmp_path / "few", tmp_path / "many"]), "gac (many)")
+    assert [(row[2], row[4]) for row in rows] == [
+        ("gac", "11.0"),
+        ("of-few", "1.50"),
+        ("gac (many)", "21.0"),
+        ("of-many", "1.50"),
+    ]
+    assert rows[0][-1].startswith("-10.0, "), "gac over gac (many)"
 
 
 def test_the_command_prints_the_committed_results(capsys):

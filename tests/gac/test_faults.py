@@ -162,6 +162,18 @@ def test_what_an_environment_says_stays_apart_from_what_is_said_of_it(cls, says,
         small_model(_Broken("raise", at_step=0, says=says), cls=cls).learn(10)
 
 
+def test_an_environment_is_named_whatever_else_stands_around_it():
+    """Each wrapper that a model was given has a guard of its own, around one count of environments."""
+    env = DummyVecEnv(_broken("raise", at_step=3))
+    small_model(VecFrameStack(env, 2))
+    with pytest.raises(EnvironmentFailedError, match="Environment 1 raised RuntimeError"):
+        small_model(env).learn(10)
+    env = DummyVecEnv(_broken("raise", at_step=3))
+    small_model(env)
+    with pytest.raises(EnvironmentFailedError, match="Environment 1 raised RuntimeError"):
+        small_model(VecFrameStack(env, 2)).learn(10)
+
+
 def test_an_environment_that_raises_at_reset_is_named():
     model = small_model(DummyVecEnv(_broken("raise", at_step=0)))
     with pytest.raises(EnvironmentFailedError, match="Environment 1 raised RuntimeError"):
