@@ -104,7 +104,8 @@ class GradientSteps(BaseAlgorithm):
             return {}
         with self._precision():
             value, metrics = loss(*tensors)
-        metrics = {name: metric.detach() for name, metric in {f"{names[0]}_loss": value, **metrics}.items()}
+        metrics = {f"{names[0]}_loss": value, **metrics}
+        metrics = {name: metric.detach() if metric.requires_grad else metric for name, metric in metrics.items()}
         trained = {name: self.policy.trained[name] for name in names if name not in self._resting}
         parameters = [parameter for network in trained.values() for parameter in network.parameters]
         gradients: Sequence[th.Tensor] = ()
@@ -287,8 +288,9 @@ def scale_of(norms: Sequence[th.Tensor], max_norm: float | None) -> th.Tensor | 
     if max_norm is None or not norms:
         return None
     norm = norms[0] if len(norms) == 1 else th.linalg.vector_norm(th.stack(list(norms)))
-    scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
-    return None if _is_on_host(scale) and not th.compiler.is_compiling() and scale == 1 else scale
+    if _is_on_host(norm) and not th.compiler.is_compiling() and float(norm) + 1e-6 <= max_norm:
+        return None
+    return (max_norm / (norm + 1e-6)).clamp(max=1.0)
 
 
 def _is_on_host(tensor: th.Tensor) -> bool:

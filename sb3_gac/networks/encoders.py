@@ -31,7 +31,8 @@ class VectorExtractor(BaseFeaturesExtractor):
         :param observations: dict with at least these entries, (B, ...) of each
         :return: features, shape (B, F)
         """
-        return th.cat([observations[key].float() for key in self._keys], dim=-1)
+        entries = [observations[key] for key in self._keys]
+        return th.cat([entry if entry.dtype == th.float32 else entry.float() for entry in entries], dim=-1)
 
     @staticmethod
     def fits(space: spaces.Dict) -> bool:

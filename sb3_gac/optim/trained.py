@@ -21,7 +21,8 @@ class AdamTensors(NamedTuple):
     :param parameters: parameters of one network
     :param exp_avgs: running mean of each parameter's gradient, of the parameter's shape
     :param exp_avg_sqs: running mean of each gradient's square, of the parameter's shape
-    :param steps: number of steps taken so far, a scalar for each parameter
+    :param counts: number of steps taken so far for each parameter, shape (number of parameters,)
+    :param steps: the same numbers as a scalar for each parameter, views of ``counts``, so that one call adds to all
     :param learning_rate: learning rate, scalar
     :param powers: beta1 and beta2 to the power of the number of steps, a scalar of each for every parameter; for compiled
         steps, which would otherwise compute the powers for each element of a parameter
@@ -30,6 +31,7 @@ class AdamTensors(NamedTuple):
     parameters: list[th.Tensor]
     exp_avgs: list[th.Tensor]
     exp_avg_sqs: list[th.Tensor]
+    counts: th.Tensor
     steps: list[th.Tensor]
     learning_rate: th.Tensor
     powers: tuple[list[th.Tensor], list[th.Tensor]]
@@ -142,10 +144,13 @@ class TrainedParameters:
                 state["step"] = th.zeros((), device=parameter.device)
                 state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(parameter), th.zeros_like(parameter)
         states = [self.optimizer.state[parameter] for parameter in parameters]
-        means, squares, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
         learning_rate = th.zeros((), device=self.everything[0].device if self.everything else None)
+        counts = th.stack([state["step"] for state in states]) if states else learning_rate.new_zeros(0)
+        for state, count in zip(states, counts, strict=True):
+            state["step"] = count
+        means, squares, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
         powers = [step.clone() for step in steps], [step.clone() for step in steps]
-        adam = AdamTensors(list(parameters), means, squares, steps, learning_rate, powers)
+        adam = AdamTensors(list(parameters), means, squares, counts, steps, learning_rate, powers)
         adam.bring_up_powers(self.optimizer.param_groups[0]["betas"])
         return adam
 
@@ -233,7 +238,7 @@ def adam_step(adam: AdamTensors, gradients: Sequence[th.Tensor], options: dict) 
     """
     decoupled, weight_decay, eps = options["decoupled_weight_decay"], options["weight_decay"], options["eps"]
     beta1, beta2 = options["betas"]
-    th._foreach_add_(adam.steps, 1)
+    adam.counts.add_(1)
     if not th.compiler.is_compiling():
         fused = th._fused_adamw_ if decoupled else th._fused_adam_
         fused(

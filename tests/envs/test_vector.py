@@ -181,7 +181,7 @@ def test_what_it_cannot_do_is_said():
     with pytest.raises(RuntimeError, match="Counters must be reset before its first step"):
         env.step(np.zeros((1, 1)))
     env.set_options({"goal": 1})
-    with pytest.raises(ValueError, match="Counters takes no reset options, got .*goal"):
+    with pytest.raises(ValueError, match=r"Counters takes no reset options, got .*goal"):
         env.reset()
     with pytest.raises(ValueError, match="vec_env must be of one environment, got 2"):
         SingleEnv(Counters(2))

@@ -185,3 +185,22 @@ def test_a_gradient_within_its_bound_is_not_multiplied():
     assert scale_of([th.tensor(3.0), th.tensor(4.0)], 10.0) is None, "of both together"
     th.testing.assert_close(scale_of([th.tensor(3.0), th.tensor(4.0)], 2.0), th.tensor(0.4))
     assert scale_of([th.tensor(float("nan"))], 0.5).isnan(), "what is not finite shows"
+
+
+def test_steps_by_hand_in_between_count_once_for_each_parameter():
+    """A user may pre-train a network with its optimiser; the counters of all parameters are views of one tensor."""
+    ours = _parameters((3, 2), (2,), (1,))
+    theirs = deepcopy(ours)
+    trained = TrainedParameters(ours, th.optim.Adam(ours, lr=0.1, fused=True))
+    plain = th.optim.Adam(theirs, lr=0.1, foreach=False)
+    for step in range(6):
+        gradients = _gradients(ours, step)
+        if step % 2:
+            _plain_step(trained.optimizer, ours, gradients)
+        else:
+            trained.step(gradients, None)
+        _plain_step(plain, theirs, gradients)
+    for one, other in zip(ours, theirs, strict=True):
+        th.testing.assert_close(one, other)
+        assert trained.optimizer.state[one]["step"] == 6
+    assert [entry["step"].shape for entry in trained.optimizer.state_dict()["state"].values()] == [()] * 3
