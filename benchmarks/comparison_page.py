@@ -19,8 +19,9 @@ from benchmarks.headroom import (
     title,
 )
 from benchmarks.intervals import CONFIDENCE, Difference, mean_interval
+from benchmarks.page.cells import palette, title_of
 from benchmarks.page.document import document, tabs
-from benchmarks.page.plots import RETURN, STEPS, Plot, algorithm_lines, palette, title_of
+from benchmarks.page.plots import RETURN, STEPS, Plot, algorithm_lines
 from benchmarks.page.tables import Field, table
 
 _FRAME = {

@@ -19,19 +19,9 @@ import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
+from benchmarks.page.cells import NOT_RUN, grid, is_wanted, palette, returns_range, title_of
 from benchmarks.page.document import page
-from benchmarks.page.plots import (
-    NOT_RUN,
-    RETURN,
-    curves,
-    grid,
-    has_guider,
-    is_wanted,
-    palette,
-    returns_range,
-    steps_label,
-    title_of,
-)
+from benchmarks.page.plots import RETURN, curves, has_guider, steps_label
 from benchmarks.page.plots import interactive as interactive  # the plot of returns on the page, a figure of plotly
 from benchmarks.tidy import NEEDED, read_tidy, with_needed_steps
 

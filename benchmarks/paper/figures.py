@@ -10,7 +10,7 @@ import matplotlib
 import pandas as pd
 import yaml
 
-from benchmarks.page.plots import palette, title_of
+from benchmarks.page.cells import palette, title_of
 from benchmarks.suite import HERE, read_suite
 from benchmarks.tidy import NEEDED, read_tidy, with_needed_steps
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import benchmarks.bootstrap
 from benchmarks.aggregate import compare, summarise_cells
-from benchmarks.page.plots import palette
+from benchmarks.page.cells import palette
 from benchmarks.report import draw, interactive, main
 
 ROOT = Path(__file__).parents[2]
