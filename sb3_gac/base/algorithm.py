@@ -75,6 +75,11 @@ class AsymmetricAlgorithm(
     def _setup_lr_schedule(self) -> None:
         self.lr_schedule = PlainSchedule(self.learning_rate)
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        """See SB3's method; schedules are asked for no moment after the end, which a last rollout may go beyond."""
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
+
     def _setup_model(self) -> None:
         make_arguments_plain(self)
         self._check_arguments()
@@ -208,23 +213,20 @@ class AsymmetricAlgorithm(
         Load the frozen teachers that are not loaded yet.
 
         :param needed: whether training is about to begin, for which every teacher must be there
-        :raises ValueError: if a needed teacher is missing, or a teacher was trained on other spaces
+        :raises ValueError: if a needed teacher is missing, or a teacher was trained on other spaces or on another scale
         """
         assert isinstance(self.observation_space, spaces.Dict)
         for name in set(self.frozen_arguments) - set(self.frozen):
             source = getattr(self, name)
             if source is not None:
                 self.frozen[name] = load_frozen_policy(source, self.observation_space, self.action_space, self.device, name)
-                if self.frozen[name].trained_normalised and self.get_vec_normalize_env() is None:
-                    raise ValueError(
-                        f"{name} learned from observations that VecNormalize normalised, but env gives raw ones: wrap env "
-                        "in VecNormalize.load(<its statistics>, env), or train it without."
-                    )
             elif needed:
                 raise ValueError(
                     f"{type(self).__name__} trains with a {name}: pass {name}=<a trained model or its path>, to load() and "
                     "resume() as well."
                 )
+        for name, teacher in self.frozen.items():
+            teacher.check_scale(name, self.env)
 
     # --- save and load ----------------------------------------------------------------------------------------------
 

@@ -52,6 +52,7 @@ class DataCollection(OffPolicyAlgorithm):
     _make_replay_buffer: Callable[[], ReplayBuffer]
     _replay_buffer_options: Callable[[], dict[str, Any]]
     _fit_action_noise: Callable[[], None]
+    check_samples_from: Callable[[type[ReplayBuffer] | None], None]
     note_use: Callable[[], None]
     call_hooks: Callable[[np.ndarray], None]
     reset_if_used_elsewhere: Callable[[VecEnv], None]
@@ -133,8 +134,9 @@ class DataCollection(OffPolicyAlgorithm):
         """
         See SB3's ``load_replay_buffer``; the model's arguments say how the buffer is sampled, not the file.
 
-        :raises ValueError: naming the observation entries whose spaces are not the model's, or if another number of
-            environments filled the buffer; the model then keeps the buffer that it had
+        :raises ValueError: naming the observation entries whose spaces are not the model's, or the buffer's class if the model
+            can't learn from it, or if another number of environments filled the buffer; the model then keeps the buffer that
+            it had
         """
         before = self.replay_buffer
         try:
@@ -143,6 +145,7 @@ class DataCollection(OffPolicyAlgorithm):
             loaded, self.replay_buffer = self.replay_buffer, before
         assert loaded is not None
         check_same_spaces_as(self, loaded, "replay buffer")
+        self.check_samples_from(type(loaded))
         if self.env is not None:
             _check_number(loaded, self.n_envs)
         self.replay_buffer = loaded

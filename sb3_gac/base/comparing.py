@@ -49,10 +49,11 @@ class ReturnComparison(EpisodeHooks):
 
     def on_step(self) -> None:
         """See :meth:`EpisodeHooks.on_step`."""
-        if self.num_timesteps < self.next_comparison:
-            return
-        self.next_comparison = self.num_timesteps - self.num_timesteps % self.compare_every + self.compare_every
-        if all(self.returns.values()):
+        is_due = self.num_timesteps >= self.next_comparison
+        counts_anew = self.next_comparison > self.num_timesteps + self.compare_every  # in another learn(), from 0 again
+        if is_due or counts_anew:
+            self.next_comparison = self.num_timesteps - self.num_timesteps % self.compare_every + self.compare_every
+        if is_due and all(self.returns.values()):
             first, second = (float(np.mean(returns)) for returns in self.returns.values())
             self.compare(first - second)
 

@@ -13,11 +13,13 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_gac.base.loading import class_of_model
 from sb3_gac.base.policy import AsymmetricPolicy
-from sb3_gac.checks.entries import encode
+from sb3_gac.base.strict_predict import DeploymentGuard, entries_normalised_by
+from sb3_gac.checks.entries import encode, leading_dimensions
 from sb3_gac.math.distributions import TanhGaussian
 
 
@@ -35,8 +37,10 @@ class FrozenPolicy(nn.Module):
         super().__init__()
         if not (isinstance(model, SAC) or isinstance(getattr(model, "policy", None), AsymmetricPolicy)):
             raise TypeError(f"{name} must be a model of sb3_gac, or SB3's SAC on a Dict space, got {type(model).__name__}.")
+        if getattr(model, "use_sde", False):
+            raise ValueError(f"{name} explores by gSDE, whose distribution is not one of the action alone: train it without.")
         self.policy = deepcopy(model.policy)  # because the model itself may go on training
-        self.trained_normalised = bool(getattr(model, "trained_normalised", False))
+        self.normalised = _normalised_entries(model)
         if isinstance(self.policy, AsymmetricPolicy) and (self.policy.remembers or any(self.policy.rnn_types.values())):
             raise ValueError(f"{name} has a memory, but is given single transitions: train a {name} without a memory.")
         self.requires_grad_(False)
@@ -54,9 +58,42 @@ class FrozenPolicy(nn.Module):
         if isinstance(policy, AsymmetricPolicy):
             return policy.behaviour_distribution(obs)
         space = policy.observation_space
-        entries = {key: encode(obs[key], space[key], policy.normalize_images) for key in space.spaces}
+        key, *_ = space.spaces
+        leading = obs[key].shape[: leading_dimensions(obs[key], space[key])]
+        rows = {
+            key: obs[key].flatten(0, len(leading) - 1) for key in space.spaces
+        }  # SB3's encoder knows one leading dimension
+        entries = {key: encode(values, space[key], policy.normalize_images) for key, values in rows.items()}
         latent = policy.actor.latent_pi(policy.actor.features_extractor(entries))
-        return TanhGaussian(policy.actor.mu(latent), policy.actor.log_std(latent).clamp(-20, 2))
+        mean, log_std = policy.actor.mu(latent), policy.actor.log_std(latent).clamp(-20, 2)
+        return TanhGaussian(mean.unflatten(0, leading), log_std.unflatten(0, leading))
+
+    def check_scale(self, name: str, env: VecEnv | None) -> None:
+        """
+        Check that environments give observations of the scale that the policy was trained on.
+
+        :param name: name of the argument that the model was given as, for messages
+        :param env: environments whose observations the policy is going to read
+        :raises ValueError: naming an entry that is normalised in one of the two cases alone
+        """
+        if self.normalised is None:
+            return
+        then, now = self.normalised, entries_normalised_by(env)
+        for key in self.policy.observation_space.spaces:  # type: ignore[attr-defined]
+            if (key in then) != (key in now):
+                ways = ("raw", "normalised by VecNormalize")
+                raise ValueError(
+                    f'{name} was trained on an entry "{key}" that was {ways[key in then]}, but env gives it '
+                    f"{ways[key in now]}: wrap env as in the {name}'s training, in VecNormalize.load(<its statistics>, env) "
+                    f"if there was a VecNormalize, or train the {name} on such observations."
+                )
+
+
+def _normalised_entries(model: Any) -> tuple[str, ...] | None:
+    """The entries that a model learned from as VecNormalize normalised them; ``None`` if that is not known."""
+    if isinstance(model, DeploymentGuard):
+        return model.normalised_entries
+    return None if model.env is None else entries_normalised_by(model.env)
 
 
 def load_frozen_policy(

@@ -13,7 +13,7 @@ class EpisodeHooks(BaseAlgorithm):
     """Calls :meth:`on_step` and :meth:`on_episode_end`, which do nothing until an algorithm overrides them."""
 
     policy: AsymmetricPolicy
-    #: For each environment: role of the policy that acts, return of the episode so far, whether warm-up actions were in it
+    #: For each environment: role of the policy that acts, return of the episode so far, whether some actions were no policy's
     acting: Sequence[str] = ()
     _returns_so_far: Any = None
     _has_warmed_up: Any = None
@@ -27,7 +27,7 @@ class EpisodeHooks(BaseAlgorithm):
 
         :param env: index of the environment
         :param episode_return: sum of the episode's rewards before normalisation
-        :param role: role of the policy that acted in the episode; ``None`` if some actions were the warm-up's
+        :param role: role of the policy that acted in the episode; ``None`` if some actions were the warm-up's or a recording's
         """
 
     def begin_episodes(self, n_envs: int) -> None:

@@ -31,6 +31,7 @@ from sb3_gac.networks.heads import resolve_target_entropy
 from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.episodes import EpisodeReplayBuffer, check_learns_from_sequences
+from sb3_gac.replay.histories import check_samples_histories
 
 ENT_COEF_START = 0.1
 _EPISODE = 1_000
@@ -100,6 +101,8 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
     """
 
     argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = OFF_POLICY_CHECKS
+    #: Whether the algorithm has phases in which its batches have histories, see :attr:`history_length`
+    samples_histories: ClassVar[bool] = False
     compiled_settings = (*AsymmetricAlgorithm.compiled_settings, "tau")
     restored_arguments = (*AsymmetricAlgorithm.restored_arguments, "ent_coef")
     fixed_arguments = (*AsymmetricAlgorithm.fixed_arguments, "buffer_size", "replay_buffer_class")
@@ -180,9 +183,20 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         if self.recording is not None and not issubclass(buffer_class, CompactDictReplayBuffer):
             raise ValueError("recording needs a CompactDictReplayBuffer: leave replay_buffer_class out.")
         self._make_behaviour()
-        if self.is_recurrent:
-            check_learns_from_sequences(self.replay_buffer_class, self.n_steps)
+        self.check_samples_from(self.replay_buffer_class)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
+
+    def check_samples_from(self, replay_buffer_class: type[ReplayBuffer] | None) -> None:
+        """
+        Check that a class of replay buffers has the kind of batches that the algorithm learns from.
+
+        :param replay_buffer_class: class of the replay buffer, ``None`` for the default
+        :raises ValueError: if the class has none; the message names it
+        """
+        if self.is_recurrent:
+            check_learns_from_sequences(replay_buffer_class, self.n_steps)
+        if self.samples_histories:
+            check_samples_histories(replay_buffer_class)
 
     def check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
         """See :meth:`ResumableAlgorithm.check_fixed_arguments`; the replay buffer's storage options are fixed as well."""

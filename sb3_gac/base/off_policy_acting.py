@@ -51,15 +51,15 @@ class OffPolicyActing(EpisodeHooks, DataCollection):
     def _next_action(
         self, learning_starts: int, action_noise: ActionNoise | None, n_envs: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        if self._recorded is not None:
-            scaled = self._recorded.actions(self.num_timesteps // n_envs).reshape(n_envs, *self.action_space.shape)  # type: ignore
-            return self._in_environments_range(scaled), scaled
         warms_up = self.num_timesteps < learning_starts
         episode_starts = np.ones(n_envs, dtype=bool) if self._last_episode_starts is None else self._last_episode_starts
         if len(self.acting) != n_envs:
             self.begin_episodes(n_envs)
         self.acting = self.choose_acting(episode_starts)
-        self._has_warmed_up |= warms_up
+        self._has_warmed_up |= warms_up or self._recorded is not None  # no policy of this run acts on a recording
+        if self._recorded is not None:
+            scaled = self._recorded.actions(self.num_timesteps // n_envs).reshape(n_envs, *self.action_space.shape)  # type: ignore
+            return self._in_environments_range(scaled), scaled
         if warms_up and not (self.is_recurrent or self.policy.remembers):
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, dict)

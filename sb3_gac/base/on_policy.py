@@ -7,6 +7,7 @@ from math import ceil
 from typing import Any, ClassVar
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, GymEnv, Schedule
 from stable_baselines3.common.utils import explained_variance
 from typing_extensions import Unpack
@@ -19,6 +20,7 @@ from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import RoleKeys
 from sb3_gac.base.rollouts import RolloutCollection
 from sb3_gac.checks.arguments import COMMON_CHECKS, ArgumentCheck, PlainSchedule, check_switch, unless
+from sb3_gac.checks.entries import check_held_by_sb3
 from sb3_gac.checks.values import check_fraction, check_integer, check_not_negative, check_positive, check_schedule
 
 
@@ -110,7 +112,18 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
         super()._check_arguments()
         if self.is_recurrent:
             raise ValueError(f"{type(self).__name__} has no form with a memory: leave rnn_type out.")
-        rollout = self.n_steps * self.n_envs
+        assert isinstance(self.observation_space, spaces.Dict)
+        check_held_by_sb3("The rollout buffer", self.observation_space, "make the entry one-dimensional in the environment")
+        self.check_minibatches(self.n_envs)
+
+    def check_minibatches(self, n_envs: int) -> None:
+        """
+        Check that the advantages of every minibatch can be normalised.
+
+        :param n_envs: number of environments
+        :raises ValueError: if a minibatch would have one transition; the message names the argument to change
+        """
+        rollout = self.n_steps * n_envs
         if self.normalize_advantage and min(self.batch_size, rollout) < 2:
             raise ValueError("normalize_advantage needs two transitions in a minibatch: raise batch_size or n_steps.")
         if self.normalize_advantage and rollout % self.batch_size == 1:

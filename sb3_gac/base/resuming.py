@@ -58,6 +58,7 @@ class ResumableAlgorithm(BaseAlgorithm):
         "ep_success_buffer",
         "strict_deployment",
         "trained_normalised",
+        "normalised_entries",
         "_compiles_on_auto",
     )
     #: Arguments that ``resume`` can't change, because the checkpoint's networks and data were made with them

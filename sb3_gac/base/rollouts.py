@@ -68,6 +68,7 @@ class RolloutCollection(OnPolicyAlgorithm):
     _returns_so_far: Any
     note_use: Callable[[], None]
     reset_if_used_elsewhere: Callable[[VecEnv], None]
+    check_minibatches: Callable[[int], None]
     call_hooks: Callable[[np.ndarray], None]
 
     def _setup_model(self) -> None:
@@ -84,6 +85,7 @@ class RolloutCollection(OnPolicyAlgorithm):
         """See SB3's ``set_env``; between two rollouts, the number of environments may change."""
         assert isinstance(env, VecEnv)
         if env.num_envs != self.n_envs:
+            self.check_minibatches(env.num_envs)
             self.n_envs, self._last_obs, self._obs_after_last_step = env.num_envs, None, None
             self._make_rollout_buffer()
         super().set_env(env, force_reset)

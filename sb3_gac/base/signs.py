@@ -8,9 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_gac.base.batch import Batch
 from sb3_gac.base.comparing import ReturnComparison
+from sb3_gac.replay.episodes import holds_a_batch
 
 #: Episodes of each policy in a block; blocks share none, so that chance does not carry over from one to the next
 BLOCK = 40
@@ -78,6 +80,7 @@ class GuidanceSigns(ReturnComparison):
     gamma: float
     _last_metrics: Mapping[str, float]
     _sample_batch: Callable[[int], Batch]
+    replay_buffer: ReplayBuffer | None
     #: Cause -> message that says what happened, with places for numbers, and which setting to change
     remedies: ClassVar[Mapping[str, str]]
     #: Role of a policy -> returns of its episodes in the block under way
@@ -112,7 +115,7 @@ class GuidanceSigns(ReturnComparison):
         """See :meth:`EpisodeHooks.on_step`."""
         is_due = self.num_timesteps >= self.next_comparison
         super().on_step()
-        if is_due and self._n_updates:
+        if is_due and self._n_updates and holds_a_batch(self.replay_buffer):  # a model that was just loaded has no data yet
             self._judge_kl(self._last_metrics)
             self._judge_gain(*self.guider_gain())
 
@@ -159,6 +162,8 @@ class GuidanceSigns(ReturnComparison):
 
     def _judge_kl(self, metrics: Mapping[str, float]) -> None:
         if not {"kl", "target_kl", "kl_coef_loss"} <= set(metrics):  # a fixed coefficient holds KL to no target
+            return
+        if metrics["target_kl"] <= 0:  # at a schedule's end; no KL is small or large beside it
             return
         numbers = {"kl": metrics["kl"], "target": metrics["target_kl"], "coefficient": metrics["kl_coef"]}
         share = metrics["kl"] / metrics["target_kl"]

@@ -1,12 +1,25 @@
 """The deployment guard: predict refuses what the deployed policy does not read."""
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_gac.base.policy import AsymmetricPolicy
+
+
+def entries_normalised_by(env: VecEnv | None) -> tuple[str, ...]:
+    """
+    The observation entries that a ``VecNormalize`` around environments normalises.
+
+    :param env: vectorised environments of Dict observations, or ``None``
+    :return: names of the entries; empty without a ``VecNormalize`` that normalises observations
+    """
+    vec_normalize = None if env is None else unwrap_vec_normalize(env)
+    return tuple(vec_normalize.norm_obs_keys or ()) if vec_normalize is not None and vec_normalize.norm_obs else ()
 
 
 class DeploymentGuard(BaseAlgorithm):
@@ -26,10 +39,21 @@ class DeploymentGuard(BaseAlgorithm):
     strict_deployment: bool = False
     #: Whether the model learned from observations that ``VecNormalize`` normalised, whose statistics deployment then needs
     trained_normalised: bool = False
+    #: The entries of those observations that it normalised; ``None`` if that is not known, in files of earlier versions
+    normalised_entries: tuple[str, ...] | None = None
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         result = super()._setup_learn(*args, **kwargs)
-        self.trained_normalised = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
+        now = entries_normalised_by(self.env)
+        before = self.normalised_entries
+        if self._n_updates and before is not None and set(now) != set(before):
+            warnings.warn(
+                f"The model has learned from observations whose entries {list(before)} VecNormalize normalised, and goes on "
+                f"with observations whose entries {list(now)} it normalises: wrap the environments as before, with "
+                "VecNormalize.load(<its statistics>, env), or train a new model.",
+                stacklevel=3,
+            )
+        self.trained_normalised, self.normalised_entries = bool(now), now
         return result
 
     def predict(

@@ -24,7 +24,6 @@ from sb3_gac.networks.actors import Actor
 from sb3_gac.networks.adaptation import Adaptation
 from sb3_gac.networks.critics import CriticEnsemble
 from sb3_gac.networks.encoders import JoinedExtractor, LatentExtractor
-from sb3_gac.replay.histories import check_samples_histories
 
 
 class RMAPolicy(AsymmetricPolicy):
@@ -112,6 +111,7 @@ class RMA(AsymmetricOffPolicyAlgorithm):
         "phase_1_steps": unless(None, check_integer, low=1, remedy="or None for half of the steps"),
     }
     compiled_settings = (*AsymmetricOffPolicyAlgorithm.compiled_settings, "target_entropy", "phase")
+    samples_histories = True
     policy: RMAPolicy
 
     def __init__(
@@ -129,7 +129,6 @@ class RMA(AsymmetricOffPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_samples_histories(self.replay_buffer_class)
         if self.phase_1_steps is not None and self.phase_1_steps <= self.learning_starts:
             raise ValueError(f"phase_1_steps must be above learning_starts={self.learning_starts}, got {self.phase_1_steps}.")
         if self.is_recurrent or (self.policy_kwargs or {}).get("share_features_extractor"):

@@ -111,6 +111,11 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         self.start_comparing("actor", "auxiliary", compare_every, window)
         super().__init__(policy, env, *sb3, **shared)
 
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if self.recording is not None:
+            raise ValueError("TGRL compares its actors' episodes, but no actor acts on a recording: leave recording out.")
+
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The entropy temperature and the weight of the teacher."""
         teacher_coef = AdditiveCoefficient(self.teacher_coef, self.coef_step, (0.0, 1e4), self.device)

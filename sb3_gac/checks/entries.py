@@ -80,14 +80,23 @@ def check_held_by(buffer_class: type[ReplayBuffer] | None, space: spaces.Dict, o
     :param own: base class of this package's buffers, which hold every supported entry
     :raises ValueError: naming the first entry that SB3's buffers can't hold
     """
-    if buffer_class is None or issubclass(buffer_class, own):
-        return
+    if buffer_class is not None and not issubclass(buffer_class, own):
+        name = f"replay_buffer_class={buffer_class.__name__}"
+        check_held_by_sb3(name, space, "leave replay_buffer_class out, or make the entry one-dimensional in the environment")
+
+
+def check_held_by_sb3(buffer: str, space: spaces.Dict, remedy: str) -> None:
+    """
+    Check that a buffer of SB3's can hold the observation's entries.
+
+    :param buffer: name of the buffer, for the message
+    :param space: observation space of the environment
+    :param remedy: text that says what to do instead
+    :raises ValueError: naming the first entry that SB3's buffers can't hold
+    """
     for key, entry in space.spaces.items():
         if (entry.shape == () and isinstance(entry, spaces.Box)) or get_obs_shape(entry) != stored_shape(entry):
-            raise ValueError(
-                f"replay_buffer_class={buffer_class.__name__} can't hold the observation's entry \"{key}\" of shape "
-                f"{entry.shape}: leave replay_buffer_class out, or make the entry one-dimensional in the environment."
-            )
+            raise ValueError(f"{buffer} can't hold the observation's entry \"{key}\" of shape {entry.shape}: {remedy}.")
 
 
 def stored_shape(space: spaces.Space) -> tuple[int, ...]:

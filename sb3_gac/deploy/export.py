@@ -150,14 +150,15 @@ def export_learner(
 
 def _normalizer_of(model: AsymmetricAlgorithm) -> DeploymentNormalizer | None:
     vec_normalize = model.get_vec_normalize_env()
-    if vec_normalize is None and model.trained_normalised:
+    keys = model.policy.role_keys[model.policy.roles.deployed]
+    normalised = keys if model.normalised_entries is None else model.normalised_entries  # files of earlier versions lack it
+    if vec_normalize is None and model.trained_normalised and not set(keys).isdisjoint(normalised):
         raise ValueError(
             "The model learned from observations that VecNormalize normalised, but was loaded without it: load it with "
             'env=VecNormalize.load("<its statistics>", venv), or pass normalizer=DeploymentNormalizer.from_vec_normalize(...).'
         )
     if vec_normalize is None:
         return None
-    keys = model.policy.role_keys[model.policy.roles.deployed]
     normalizer = DeploymentNormalizer.from_vec_normalize(vec_normalize, keys)
     wrapper = model.wrapper_outside_normalisation
     if wrapper is not None and normalizer.mean:

@@ -26,6 +26,8 @@ class Memory(nn.Module):
         :return: state of the memory, shape (1, B, S)
         :raises ValueError: if ``state`` or ``episode_start`` has another number of rows than B
         """
+        if episode_start is not None:
+            episode_start = np.atleast_1d(episode_start)  # a single environment's done
         for name, given in (("state", state), ("episode_start", episode_start)):
             if given is not None and len(given) != batch:
                 raise ValueError(

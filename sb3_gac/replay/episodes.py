@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.samples import SequenceSamples
@@ -227,3 +229,17 @@ def check_learns_from_sequences(replay_buffer_class: type | None, n_steps: int) 
         )
     if n_steps != 1:
         raise ValueError(f"n_steps must be 1 for a recurrent policy, got {n_steps}.")
+
+
+def holds_a_batch(buffer: ReplayBuffer | None) -> bool:
+    """
+    Whether there is data to draw a batch from: a step, or a whole episode where sequences or goals are sampled.
+
+    :param buffer: replay buffer of any class; ``None`` for none
+    :return: whether its ``sample`` can return a batch
+    """
+    if isinstance(buffer, EpisodeReplayBuffer):
+        return buffer.n_episodes > 0
+    if isinstance(buffer, HerReplayBuffer):
+        return bool((buffer.ep_length > 0).any())
+    return buffer is not None and buffer.size() > 0

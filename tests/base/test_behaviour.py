@@ -112,3 +112,11 @@ def test_an_episode_that_warm_up_had_a_part_in_is_nobodys(cls):
     rewards = model.replay_buffer.rewards[:12, 0].reshape(4, 3)
     returns = [episode_return for env, episode_return, _ in ended if env == 0]
     assert returns == pytest.approx(rewards.sum(axis=1).tolist(), rel=1e-5)
+
+
+def test_shares_are_asked_for_no_moment_after_the_end():
+    """A last round may go beyond the steps that were asked for."""
+    moments = []
+    share = lambda progress: moments.append(progress) or 0.5 * progress  # noqa: E731
+    small_model(behaviour={"learner": share}, train_freq=64).learn(100)
+    assert min(moments) == 0.0

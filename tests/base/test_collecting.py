@@ -24,7 +24,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, EnvironmentFailedError, InvalidStepError
+from sb3_gac import GAC, RMA, AsymmetricSAC, EnvironmentFailedError, InvalidStepError
 from sb3_gac.checks import processes
 from sb3_gac.checks.environments import guard_of
 from sb3_gac.checks.processes import WatchedPipe, end_processes
@@ -1069,3 +1069,28 @@ def test_an_exported_policy_has_no_statistics_of_another_shape(tmp_path):
         model = _model(VecFrameStack(VecNormalize(Diary().envs(1)), 3)).learn(20)
     with pytest.raises(ValueError, match=r"VecFrameStack stands outside VecNormalize.*normalizer="):
         export_learner(model, tmp_path / "policy.onnx")
+
+
+def test_a_model_for_goals_that_was_just_loaded_has_no_episode_to_look_at(tmp_path):
+    _her_model(_Goal(), learning_starts=20).learn(40).save(tmp_path / "model")
+    loaded = GAC.load(tmp_path / "model", env=_Goal(), learning_starts=100)
+    loaded.compare_every, looks = 1, []
+    loaded._judge_gain = lambda gain, error: looks.append(loaded.num_timesteps)
+    loaded.learn(20, reset_num_timesteps=False)
+    assert looks[0] == 46, "where the first episode ends"
+
+
+@pytest.mark.parametrize(
+    ("cls", "options", "says"),
+    [
+        (GAC, {"policy": "MultiInputGruPolicy"}, "give EpisodeReplayBuffer or a subclass"),
+        (RMA, {"history": 2}, "can't sample what came before"),
+    ],
+)
+def test_a_buffer_that_the_model_can_not_learn_from_is_not_loaded(cls, options, says, tmp_path):
+    small_model(replay_buffer_class=DictReplayBuffer).learn(20).save_replay_buffer(tmp_path / "buffer")
+    model = small_model(cls=cls, **options).learn(20)
+    before = model.replay_buffer
+    with pytest.raises(ValueError, match=says):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is before

@@ -1,5 +1,7 @@
 """With strict_deployment, predict refuses what the learner does not read, by name; without it, it ignores that."""
 
+import warnings
+
 import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -68,3 +70,18 @@ def test_a_model_remembers_whether_its_observations_were_normalised(norm_obs, ex
     env = VecNormalize(DummyVecEnv([TwoViewBandit]), norm_obs=norm_obs)
     assert small_model(env).learn(10).trained_normalised == expected
     assert not small_model().learn(10).trained_normalised
+
+
+def test_going_on_with_observations_of_another_scale_is_said():
+    def normalised(**options):
+        return VecNormalize(DummyVecEnv([TwoViewBandit]), **options)
+
+    model = small_model(normalised()).learn(20)
+    assert set(model.normalised_entries) == {"partial", "privileged"}
+    model.set_env(TwoViewBandit())
+    with pytest.warns(UserWarning, match=r"entries \[\] it normalises: wrap the environments as before"):
+        model.learn(5)
+    assert not model.trained_normalised
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        small_model(normalised(norm_obs_keys=["partial"])).learn(20).learn(5, reset_num_timesteps=False)

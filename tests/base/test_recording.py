@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_gac import GAC, AsymmetricSAC, write_recording
+from sb3_gac import GAC, RMA, AsymmetricSAC, write_recording
 from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice, small_model
 
 ENVS = {
@@ -79,3 +79,19 @@ def test_what_has_been_overwritten_is_not_written_down(tmp_path):
     with pytest.raises(ValueError, match="that holds every step of the training"):
         write_recording(model, tmp_path / "gac.npz")
     assert not (tmp_path / "gac.npz").exists()
+
+
+def test_phases_go_on_on_a_recording(tmp_path):
+    path, arguments = tmp_path / "rma.npz", {"history": 3, "phase_1_steps": 30}
+    recorded = _recorded(TwoViewBandit, path, RMA, **arguments)
+    again = small_model(TwoViewBandit(), RMA, recording=path, **arguments)
+    episodes = []
+    again.on_episode_end = lambda env, episode_return, role: episodes.append(role)
+    again.learn(60)
+    assert recorded.phase == again.phase == 2
+    assert set(episodes) == {None}, "no policy of this run acted"
+
+
+def test_policies_are_not_compared_by_a_recording():
+    with pytest.raises(ValueError, match=r'target_kl="auto" compares episodes .* no recording'):
+        small_model(target_kl="auto", behaviour={"learner": 0.25}, recording="other.npz")

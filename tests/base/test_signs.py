@@ -197,3 +197,25 @@ def test_signs_go_on_after_a_checkpoint_and_in_a_file(tmp_path):
     assert resumed.signs_told == through.signs_told
     through.save(tmp_path / "model")
     assert GAC.load(tmp_path / "model").signs_in_a_row == through.signs_in_a_row
+
+
+def test_no_kl_is_small_or_large_beside_a_target_of_0():
+    """At a schedule's end; a schedule may begin at 0 as well."""
+    model = _model()
+    for _ in range(3 * LOOKS_IN_A_ROW):
+        model._judge_kl({"kl": 0.1, "target_kl": 0.0, "kl_coef": 0.5, "kl_coef_on_bound": 1.0, "kl_coef_loss": 0.0})
+    assert not model.signs_told
+    model = small_model(TwoViewBandit(length=4), target_kl="linear 0.01 -> 0", learning_starts=950).learn(999)
+    model.learn(100, reset_num_timesteps=False)
+
+
+def test_a_model_that_was_just_loaded_has_no_data_to_look_at(tmp_path):
+    memory = {"net_arch": [8], "rnn_hidden_size": 8, "rnn_net_arch": [8]}
+    options = {"policy": "MultiInputGruPolicy", "policy_kwargs": memory, "batch_size": 2, "learning_starts": 60}
+    small_model(TwoViewBandit(length=50), **options).learn(80).save(tmp_path / "model")
+    loaded = GAC.load(tmp_path / "model", env=TwoViewBandit(length=50), learning_starts=200)
+    loaded.compare_every = 10
+    looks = []
+    loaded._judge_gain = lambda gain, error: looks.append(loaded.num_timesteps)
+    loaded.learn(100, reset_num_timesteps=False)
+    assert looks == [130, 140, 150, 160, 170, 180], "with a whole episode"

@@ -15,7 +15,7 @@ from sb3_gac import GPOClip, GPOPenalty, InvalidStepError, OnnxPolicy, export_le
 from sb3_gac.base.rollouts import UnrolledBuffer
 from sb3_gac.math.losses import clipped_surrogate
 from sb3_gac.optim.coefficients import MultiplicativeCoefficient
-from tests.helpers import TwoViewBandit, TwoViewChoice
+from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice
 
 BOTH = [GPOClip, GPOPenalty]
 OF_POLICY = {"net_arch": [8, 8], "activation_fn": nn.SiLU}
@@ -416,3 +416,26 @@ def test_it_learns_the_two_views(cls):
     model.learn(20_000)
     obs = {"partial": np.array([[-0.5, 0.0], [0.0, 0.0], [0.5, 0.0]], np.float32)}
     np.testing.assert_allclose(model.predict(obs, deterministic=True)[0][:, 0], [-0.5, 0.0, 0.5], atol=0.12)
+
+
+@pytest.mark.parametrize("space", [spaces.Box(-1, 1, (), np.float32), spaces.MultiDiscrete([[3, 4], [2, 2]])])
+def test_an_entry_that_the_rollout_buffer_can_not_hold_is_named(space):
+    entries = {"partial": spaces.Box(-1, 1, (2,), np.float32), "more": space}
+    with pytest.raises(ValueError, match="The rollout buffer can't hold the observation's entry \"more\" of shape"):
+        make_model(Sampled(spaces.Dict(entries)))
+
+
+def test_other_environments_must_leave_no_minibatch_of_one():
+    model = make_model(DummyVecEnv([TwoViewBandit] * 2), n_steps=5, batch_size=4, n_epochs=1).learn(20)
+    with pytest.raises(ValueError, match="batch_size=4 leaves a minibatch of one of the 5 transitions"):
+        model.set_env(DummyVecEnv([TwoViewBandit]))
+    assert model.n_envs == 2
+    model.learn(20)
+
+
+def test_a_last_rollout_beyond_the_end_is_trained_with_the_schedules_ends():
+    model = make_model(n_steps=64, learning_rate=lambda progress: 1e-3 * progress, clip_range=lambda progress: 0.2 * progress)
+    model.learn(100)
+    assert model.num_timesteps == 128
+    assert model.policy.guider.optimizer.param_groups[0]["lr"] == 0.0
+    assert model.clip_range_tensor == 0.0

@@ -5,9 +5,9 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, TGRL, AsymmetricSAC
+from sb3_gac import COSIL, GAC, TGRL, AsymmetricSAC
 from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model, unlike_each_other
 
@@ -244,3 +244,74 @@ def test_training_needs_a_teacher_and_acting_does_not():
     model.predict(TwoViewBandit().reset(seed=0)[0])
     with pytest.raises(ValueError, match="TGRL trains with a teacher"):
         model.learn(5)
+
+
+def test_it_is_compared_in_a_second_training_from_the_start(model):
+    """Which counts its steps from 0 again, unless it is told not to."""
+    moments = []
+    model.compare = lambda difference: moments.append(model.num_timesteps)
+    for steps in [*range(4, 100, 4), *range(4, 40, 4)]:
+        _after(model, steps, actor=[1.0], auxiliary=[0.0])
+    assert moments == [12, 20, 32, 40, 52, 60, 72, 80, 92, 12, 20, 32]
+
+
+def test_no_actor_acts_on_a_recording():
+    with pytest.raises(ValueError, match="TGRL compares its actors' episodes, but no actor acts on a recording"):
+        _model(recording="other.npz")
+
+
+# --- a teacher's observations -------------------------------------------------------------------------------------------
+
+
+def _normalised(**options):
+    return VecNormalize(DummyVecEnv([TwoViewBandit]), **options)
+
+
+def _sac(env, **options):
+    options = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 4, "device": "cpu", **options}
+    return SAC("MultiInputPolicy", env, **options).learn(8)
+
+
+@pytest.mark.parametrize(
+    ("teacher", "env", "entry"),
+    [
+        (lambda: _sac(_normalised()), TwoViewBandit, '"partial" that was normalised by VecNormalize, but env gives it raw'),
+        (lambda: _sac(TwoViewBandit()), _normalised, '"partial" that was raw, but env gives it normalised by VecNormalize'),
+        (lambda: _teacher().learn(20), _normalised, '"partial" that was raw, but env gives it normalised'),
+        (lambda: _teacher(_normalised()).learn(20), lambda: _normalised(norm_obs=False), '"partial" that was normalised'),
+        (
+            lambda: _teacher(_normalised(norm_obs_keys=["privileged"])).learn(20),
+            lambda: _normalised(norm_obs_keys=["partial"]),
+            '"partial" that was raw',
+        ),
+    ],
+    ids=["sac, then raw", "sac raw", "raw", "rewards alone", "other entries"],
+)
+def test_a_teacher_on_another_scale_is_refused(teacher, env, entry):
+    with pytest.raises(ValueError, match=f"teacher was trained on an entry {entry}"):
+        small_model(env(), TGRL, teacher=teacher())
+
+
+def test_a_teacher_on_the_same_scale_teaches_and_other_environments_are_looked_at():
+    model = small_model(_normalised(), TGRL, teacher=_sac(_normalised())).learn(20)
+    model.set_env(TwoViewBandit())
+    with pytest.raises(ValueError, match='"partial" that was normalised by VecNormalize, but env gives it raw'):
+        model.learn(20)
+
+
+@pytest.mark.parametrize("cls", [TGRL, COSIL])
+def test_sb3s_own_may_teach_a_policy_with_a_memory(cls):
+    memory = {"net_arch": [8], "rnn_hidden_size": 4, "rnn_net_arch": [8]}
+    model = small_model(cls=cls, teacher=_sac(TwoViewBandit()), policy="MultiInputGruPolicy", policy_kwargs=memory).learn(30)
+    sequences = {"partial": th.randn(5, 3, 2), "privileged": th.rand(5, 3, 1)}
+    teacher = model.frozen["teacher"]
+    at_once = teacher(sequences)
+    for step in range(5):
+        alone = teacher({key: entry[step] for key, entry in sequences.items()})
+        th.testing.assert_close(at_once.mean[step], alone.mean)
+        th.testing.assert_close(at_once.log_std[step], alone.log_std)
+
+
+def test_a_teacher_that_explores_by_gsde_is_refused():
+    with pytest.raises(ValueError, match="teacher explores by gSDE"):
+        FrozenPolicy(_sac(TwoViewBandit(), use_sde=True))

@@ -14,7 +14,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_gac
 from sb3_gac import GAC, DeploymentNormalizer, OnnxPolicy, export_learner
@@ -403,3 +403,9 @@ def test_public_names_are_found_and_listed():
     with pytest.raises(AttributeError, match="no attribute 'PPO'"):
         sb3_gac.PPO  # noqa: B018
     assert "sb3_gac/Ant-v5" in gym.registry
+
+
+def test_statistics_of_what_the_policy_does_not_read_are_not_asked_for(tmp_path):
+    env = VecNormalize(DummyVecEnv([TwoViewBandit]), norm_obs_keys=["privileged"])
+    small_model(env).learn(20).save(tmp_path / "model")
+    export_learner(GAC.load(tmp_path / "model", device="cpu"), tmp_path / "learner.pt")

@@ -239,3 +239,13 @@ def test_a_buffer_that_no_episode_fits_in_is_an_error():
     with pytest.warns(UserWarning, match="no gradient steps"), pytest.raises(ValueError, match="buffer_size far above it"):
         model.learn(15)
     assert model.num_timesteps == 10
+
+
+@pytest.mark.parametrize("done", [True, np.bool_(True), np.array(True)])
+def test_a_single_environments_done_starts_an_episode(done):
+    model = GAC("MultiInputGruPolicy", Recall(), policy_kwargs={"rnn_hidden_size": 8}, seed=0, device="cpu")
+    observation, _ = Recall().reset(seed=0)
+    first, state = model.predict(observation, deterministic=True)
+    again, after = model.predict(observation, state, done, deterministic=True)
+    assert np.array_equal(first, again)
+    np.testing.assert_array_equal(after[0], state[0])
