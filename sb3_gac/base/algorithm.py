@@ -31,6 +31,7 @@ from sb3_gac.checks.arguments import (
     make_arguments_plain,
 )
 from sb3_gac.checks.requirements import warn_of_an_unseen_goal
+from sb3_gac.checks.scale import check_same_scale
 from sb3_gac.checks.values import plain
 from sb3_gac.networks.heads import check_action_space
 from sb3_gac.optim.coefficients import Coefficient, DualVariable, LearnedCoefficient
@@ -225,8 +226,9 @@ class AsymmetricAlgorithm(
                     f"{type(self).__name__} trains with a {name}: pass {name}=<a trained model or its path>, to load() and "
                     "resume() as well."
                 )
-        for name, teacher in self.frozen.items():
-            teacher.check_scale(name, self.env)
+        for name, frozen in self.frozen.items():
+            assert self.env is not None
+            check_same_scale(name, frozen.policy.observation_space.spaces, frozen.normalised, self.env)  # type: ignore
 
     # --- save and load ----------------------------------------------------------------------------------------------
 

@@ -13,13 +13,12 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_gac.base.loading import class_of_model
 from sb3_gac.base.policy import AsymmetricPolicy
-from sb3_gac.base.strict_predict import DeploymentGuard, entries_normalised_by
 from sb3_gac.checks.entries import encode, leading_dimensions
+from sb3_gac.checks.scale import entries_normalised_in_training
 from sb3_gac.math.distributions import TanhGaussian
 
 
@@ -40,7 +39,7 @@ class FrozenPolicy(nn.Module):
         if getattr(model, "use_sde", False):
             raise ValueError(f"{name} explores by gSDE, whose distribution is not one of the action alone: train it without.")
         self.policy = deepcopy(model.policy)  # because the model itself may go on training
-        self.normalised = _normalised_entries(model)
+        self.normalised = entries_normalised_in_training(model)
         if isinstance(self.policy, AsymmetricPolicy) and (self.policy.remembers or any(self.policy.rnn_types.values())):
             raise ValueError(f"{name} has a memory, but is given single transitions: train a {name} without a memory.")
         self.requires_grad_(False)
@@ -67,33 +66,6 @@ class FrozenPolicy(nn.Module):
         latent = policy.actor.latent_pi(policy.actor.features_extractor(entries))
         mean, log_std = policy.actor.mu(latent), policy.actor.log_std(latent).clamp(-20, 2)
         return TanhGaussian(mean.unflatten(0, leading), log_std.unflatten(0, leading))
-
-    def check_scale(self, name: str, env: VecEnv | None) -> None:
-        """
-        Check that environments give observations of the scale that the policy was trained on.
-
-        :param name: name of the argument that the model was given as, for messages
-        :param env: environments whose observations the policy is going to read
-        :raises ValueError: naming an entry that is normalised in one of the two cases alone
-        """
-        if self.normalised is None:
-            return
-        then, now = self.normalised, entries_normalised_by(env)
-        for key in self.policy.observation_space.spaces:  # type: ignore[attr-defined]
-            if (key in then) != (key in now):
-                ways = ("raw", "normalised by VecNormalize")
-                raise ValueError(
-                    f'{name} was trained on an entry "{key}" that was {ways[key in then]}, but env gives it '
-                    f"{ways[key in now]}: wrap env as in the {name}'s training, in VecNormalize.load(<its statistics>, env) "
-                    f"if there was a VecNormalize, or train the {name} on such observations."
-                )
-
-
-def _normalised_entries(model: Any) -> tuple[str, ...] | None:
-    """The entries that a model learned from as VecNormalize normalised them; ``None`` if that is not known."""
-    if isinstance(model, DeploymentGuard):
-        return model.normalised_entries
-    return None if model.env is None else entries_normalised_by(model.env)
 
 
 def load_frozen_policy(

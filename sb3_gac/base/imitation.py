@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.checks.scale import check_same_scale, entries_normalised_in_training
 from sb3_gac.checks.values import check_integer, check_positive
 from sb3_gac.math.distributions import Categorical
 
@@ -70,9 +71,13 @@ def demonstrate(
     :param student: model that acts, while the teacher only says what it would have done (DAgger); ``None`` for the teacher
     :param deterministic: whether the teacher shows its most likely action instead of a sample
     :return: all observations met, with the teacher's action on each
-    :raises ValueError: if ``n_steps`` is less than 1
+    :raises ValueError: if ``n_steps`` is less than 1, or if teacher or student were trained on observations of another scale
+        than ``env`` gives
     """
     check_integer("n_steps", n_steps, 1)
+    _check_scale("teacher", teacher, env, guides=hasattr(teacher, "predict_guider"))
+    if student is not None:
+        _check_scale("student", student, env)
     show: Any = getattr(teacher, "predict_guider", teacher.predict)
     seen: list[Mapping[str, np.ndarray]] = []
     shown: list[np.ndarray] = []
@@ -87,6 +92,14 @@ def demonstrate(
             action, own = student.predict(observation, state=own, episode_start=start)
         observation, _, start, _ = env.step(action)
     return Demonstrations({key: np.concatenate([row[key] for row in seen]) for key in seen[0]}, np.concatenate(shown))
+
+
+def _check_scale(name: str, model: BaseAlgorithm, env: VecEnv, guides: bool = False) -> None:
+    policy: Any = model.policy
+    entries = list(policy.observation_space.spaces)
+    if isinstance(policy, AsymmetricPolicy):
+        entries = list(policy.role_keys[policy.roles.behaviour if guides else policy.roles.deployed])
+    check_same_scale(name, entries, entries_normalised_in_training(model), env)
 
 
 def clone_behaviour(

@@ -6,20 +6,9 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_gac.base.policy import AsymmetricPolicy
-
-
-def entries_normalised_by(env: VecEnv | None) -> tuple[str, ...]:
-    """
-    The observation entries that a ``VecNormalize`` around environments normalises.
-
-    :param env: vectorised environments of Dict observations, or ``None``
-    :return: names of the entries; empty without a ``VecNormalize`` that normalises observations
-    """
-    vec_normalize = None if env is None else unwrap_vec_normalize(env)
-    return tuple(vec_normalize.norm_obs_keys or ()) if vec_normalize is not None and vec_normalize.norm_obs else ()
+from sb3_gac.checks.scale import entries_normalised_by
 
 
 class DeploymentGuard(BaseAlgorithm):

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, clone_behaviour, copy_networks, demonstrate
 from sb3_gac.base.imitation import Demonstrations
 from sb3_gac.envs import make_vec
+from tests.helpers import TwoViewBandit, small_model
 
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "buffer_size": 500, "learning_starts": 20, "seed": 0}
 FULL = {"role_keys": {"actor": ["partial", "privileged"]}}
@@ -179,3 +181,11 @@ def test_every_algorithm_can_be_taught(env, name):
     else:
         errors = clone_behaviour(model, shown, gradient_steps=200, batch_size=64, learning_rate=1e-2)
         assert errors["after"] < errors["before"] / 2
+
+
+@pytest.mark.parametrize("who", ["teacher", "student"])
+def test_whoever_learned_on_another_scale_is_refused(who):
+    other = small_model(VecNormalize(DummyVecEnv([TwoViewBandit]))).learn(20)
+    models = {"teacher": small_model().learn(20), "student": small_model().learn(20)} | {who: other}
+    with pytest.raises(ValueError, match=f'{who} was trained on an entry "partial" that was normalised .* env gives it raw'):
+        demonstrate(models["teacher"], DummyVecEnv([TwoViewBandit]), 10, student=models["student"])
