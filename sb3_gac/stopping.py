@@ -10,13 +10,14 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from types import FrameType
 
 MODULE, SCRIPT = "sb3_gac.train", ("sb3-gac", "train")
+#: Words that start the main job in a process of Python
+_OF_PYTHON = (("-m", MODULE), ("-m", "sb3_gac", "train"))
 INTERRUPTED = 128 + signal.SIGINT
 
 
@@ -27,10 +28,11 @@ def started_as(words: Sequence[str]) -> list[str] | None:
     :param words: words of a process's command line
     :return: words that start the main job, without its options; ``None`` if the process is another program
     """
-    for number, (word, following) in enumerate(pairwise(words)):
-        if (word, following) == ("-m", MODULE):
-            return list(words[: number + 2])
-        if (os.path.basename(word).removesuffix(".exe"), following) == SCRIPT:
+    for number, word in enumerate(words):
+        for start in _OF_PYTHON:
+            if tuple(words[number : number + len(start)]) == start:
+                return list(words[: number + len(start)])
+        if (os.path.basename(word).removesuffix(".exe"), *words[number + 1 : number + 2]) == SCRIPT:
             return list(SCRIPT)
     return None
 

@@ -22,6 +22,8 @@ ROOT = Path(__file__).parents[2]
         (["python", "-m", "sb3_gac.train", "--steps", "3"], ["python", "-m", "sb3_gac.train"]),
         (["/bin/python", "-u", "-m", "sb3_gac.train"], ["/bin/python", "-u", "-m", "sb3_gac.train"]),
         (["/bin/python", "/venv/bin/sb3-gac", "train", "--steps", "3"], ["sb3-gac", "train"]),
+        (["/bin/python", "-u", "-m", "sb3_gac", "train", "--steps", "3"], ["/bin/python", "-u", "-m", "sb3_gac", "train"]),
+        (["python", "-m", "sb3_gac", "evaluate", "train"], None),
         (["python", "/venv/bin/sb3-gac", "evaluate", "train"], None),
         (["python", "-m", "pytest", "sb3_gac.train"], None),
         (["python", "-c", "import sb3_gac.train"], None),
