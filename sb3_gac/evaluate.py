@@ -51,7 +51,7 @@ from sb3_gac.evaluation.settings import (
     plan,
 )
 from sb3_gac.evaluation.video import check_can_film, film
-from sb3_gac.stopping import INTERRUPTED
+from sb3_gac.stopping import StoppedInALine
 from sb3_gac.training.environments import STATISTICS
 from sb3_gac.training.options import mapping
 from sb3_gac.training.provenance import provenance
@@ -297,12 +297,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parse_arguments(arguments)
     if options.video is not None and "DISPLAY" not in os.environ and find_library("EGL") is not None:
         os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is first imported
-    try:
-        with one_thread():
-            _evaluate(options, shlex.join(["python", "-m", "sb3_gac.evaluate", *arguments]))
-    except KeyboardInterrupt:
-        print("\nStopped.", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+    with StoppedInALine(), one_thread():
+        _evaluate(options, shlex.join(["python", "-m", "sb3_gac.evaluate", *arguments]))
 
 
 def _evaluate(options: argparse.Namespace, command: str) -> None:

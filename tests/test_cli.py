@@ -113,6 +113,17 @@ def test_an_extra_that_is_missing_is_a_sentence_and_a_module_that_is_missing_an_
         main(["zoo", "train"])
 
 
+def test_a_program_that_is_stopped_says_so_in_a_line(monkeypatch, capsys):
+    def stopped(name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sb3_gac.__main__, "import_module", stopped)
+    with pytest.raises(SystemExit) as end:
+        main(["evaluate"])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "\nStopped.\n"
+
+
 def test_a_model_is_exported_by_a_command(tmp_path, capsys, monkeypatch):
     small_model().save(tmp_path / "model.zip")
     main(["export", str(tmp_path), str(tmp_path / "x.pt"), "--unit", "action=N m"])

@@ -15,6 +15,7 @@ from sb3_gac.base.loading import load_model, model_file
 from sb3_gac.deploy.export import WRITERS, export_learner
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import ExportError
+from sb3_gac.stopping import StoppedInALine
 from sb3_gac.training.environments import STATISTICS, read_statistics, statistics_of
 
 
@@ -43,10 +44,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     units = dict(text.split("=", 1) for text in options.unit)
     if options.out.is_dir():
         parser.error(f"out: {options.out} is a directory: name a file in it, such as {options.out / 'policy.onnx'}.")
-    try:
-        print(_export(options, units))
-    except (ValueError, OSError, ImportError, ExportError) as error:
-        sys.exit(str(error))
+    with StoppedInALine():
+        try:
+            print(_export(options, units))
+        except (ValueError, OSError, ImportError, ExportError) as error:
+            sys.exit(str(error))
 
 
 def _export(options: argparse.Namespace, units: dict[str, str]) -> str:
