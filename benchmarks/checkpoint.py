@@ -1,11 +1,9 @@
 """A run's state on disk: written in one move, so that a run can go on however its process ended."""
 
-import fcntl
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -52,22 +50,6 @@ def write_timing(path: Path, seconds: float, steps: int, learner: float) -> None
     :param learner: mean return of the learner at that evaluation
     """
     write_atomically(path, json.dumps({"seconds": seconds, "steps": steps, "learner": learner}))
-
-
-@contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """
-    Keep a run's directory for this process alone, as long as the context lasts.
-
-    :param directory: directory of the run
-    :raises RuntimeError: if another process is making the run
-    """
-    with (directory / "lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RuntimeError(f"Another process is running {directory}.") from None
-        yield
 
 
 class ExactCheckpoints:

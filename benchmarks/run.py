@@ -22,13 +22,14 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_gac
-from benchmarks.checkpoint import TIMING, checkpoints_of, locked, read_seconds, write_atomically, write_timing
+from benchmarks.checkpoint import TIMING, checkpoints_of, read_seconds, write_atomically, write_timing
 from benchmarks.config import POLICY, in_present_names, normalization, resolve, settings_in_present_names
 from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.external import Program
 from benchmarks.program import read_rows, rows_as_text
 from benchmarks.suite import RUNS, UNSAID, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.base.recording import holds_every_step
+from sb3_gac.checkpoint.lock import locked
 from sb3_gac.presets import instantiate
 from sb3_gac.training.environments import STATISTICS, normalized
 from sb3_gac.training.provenance import provenance

@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
+from sb3_gac.stopping import StoppedInALine
 from sb3_gac.version import __version__
 
 NAME = "sb3-gac"
@@ -69,7 +70,8 @@ def main(arguments: list[str] | None = None) -> None:
     before = sys.argv
     sys.argv = [f"{NAME} {names[0]}", *rest]
     try:
-        _bench(rest) if names[0] == "bench" else import_module(_module(names[0])).main()
+        with StoppedInALine():
+            _bench(rest) if names[0] == "bench" else import_module(_module(names[0])).main()
     except ImportError as error:
         if error.name is not None:
             raise

@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 from sb3_gac.envs.suites.extras import missing_extra
+from sb3_gac.stopping import StoppedInALine
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 
@@ -22,6 +23,11 @@ def main() -> None:
     """Run the command line."""
     if (CHECKOUT / "benchmarks").is_dir() and str(CHECKOUT) not in sys.path:
         sys.path.append(str(CHECKOUT))  # some ways of installing a clone leave the path out
+    with StoppedInALine():
+        _compare()
+
+
+def _compare() -> None:
     try:
         from benchmarks.comparison import main as compare
     except ImportError as error:

@@ -24,7 +24,6 @@ from typing import Any
 
 import gymnasium as gym
 import torch as th
-import yaml
 from tqdm import tqdm
 
 from sb3_gac.base.loading import load_model, model_file
@@ -52,7 +51,9 @@ from sb3_gac.evaluation.settings import (
     plan,
 )
 from sb3_gac.evaluation.video import check_can_film, film
+from sb3_gac.stopping import StoppedInALine
 from sb3_gac.training.environments import STATISTICS
+from sb3_gac.training.options import mapping
 from sb3_gac.training.provenance import provenance
 
 EVAL_SEED = 10_000
@@ -85,7 +86,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     parser.add_argument("--episodes", type=int, default=20, help="of each setting (default: 20)")
     parser.add_argument("--guider", action="store_true", help="evaluate the privileged policy too, on the same seeds")
     parser.add_argument("--env", metavar="ID", help="environment, by default that of the run; module:id and module:name too")
-    parser.add_argument("--env-kwargs", default="{}", metavar="YAML", help='its arguments, such as "{history: 4}"')
+    parser.add_argument("--env-kwargs", type=mapping, default={}, metavar="YAML", help='its arguments, such as "{history: 4}"')
     parser.add_argument(
         "--vec-normalize",
         type=Path,
@@ -101,9 +102,8 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     options = parser.parse_args(arguments)
     if options.episodes < 1:
         parser.error(f"--episodes: must be at least 1, got {options.episodes}.")
-    options.env_kwargs = yaml.safe_load(options.env_kwargs)
-    if not isinstance(options.env_kwargs, dict):
-        parser.error('--env-kwargs: must be a mapping in YAML, such as "{noise_std: 0.1, history: 4}".')
+    if options.seed < 0:
+        parser.error(f"--seed: must be at least 0, got {options.seed}.")
     options.asked = {name: getattr(options, name) for name in DEFAULTS if getattr(options, name) is not None}
     return options
 
@@ -119,22 +119,21 @@ def environment_for(options: argparse.Namespace, file: Path) -> Environment:
     """
     if options.env is not None:
         return Environment(options.env, options.env_kwargs)
-    if not (file.parent / CONFIGURATION).exists():
+    recorded = environment_of_run(file.parent)
+    if recorded is None:
         raise ValueError(
             f"--env is needed: there is no {CONFIGURATION} beside {file} that says where it was trained. Give the environment "
             'with its arguments, such as --env sb3_gac/HalfCheetah-v5 --env-kwargs "{history: 4}".'
         )
-    recorded = environment_of_run(file.parent)
     return replace(recorded, kwargs={**recorded.kwargs, **options.env_kwargs})
 
 
-def policies_of(options: argparse.Namespace, file: Path, env: gym.Env) -> tuple[str, dict[str, EvaluatedPolicy]]:
+def policies_of(options: argparse.Namespace, file: Path) -> tuple[str, dict[str, EvaluatedPolicy]]:
     """
     Load the policies to evaluate.
 
     :param options: options of the command line
     :param file: file of the model
-    :param env: environment in which the model is evaluated
     :return: name of the algorithm, or of the kind of file; and name -> policy
     :raises ValueError: if the model can't be loaded, or lacks the guider that is to be evaluated
     """
@@ -145,9 +144,7 @@ def policies_of(options: argparse.Namespace, file: Path, env: gym.Env) -> tuple[
             )
         return f"exported {file.suffix} file", {"learner": load_exported(file)}
     model = load_model(file, options.device)
-    beside = file.parent / STATISTICS
-    found = beside if model.trained_normalised and beside.exists() else None
-    normalize = normalizer_of(model, options.vec_normalize or found, env)
+    normalize = normalizer_of(model, file, options.vec_normalize)
     policies: dict[str, EvaluatedPolicy] = {"learner": learner_of(model, normalize)}
     if options.guider:
         policies["guider"] = guider_of(model, normalize)
@@ -166,10 +163,10 @@ class Evaluation:
         self.options, self.file = options, model_file(options.model)
         self.environment = environment_for(options, self.file)
         self.trained = self.environment.trained
-        env = self.environment.make(UNDISTURBED)
+        env = self._made()
         asked = options.asked or {name: values for name, values in DEFAULTS.items() if name != "noise" or is_real_valued(env)}
         self.settings, self.curves = plan(asked, self.trained)
-        self.algorithm, self.policies = policies_of(options, self.file, env)
+        self.algorithm, self.policies = policies_of(options, self.file)
         for policy in self.policies.values():
             check_fits(policy.entries, env, self.environment.env_id)
         env.close()
@@ -178,8 +175,17 @@ class Evaluation:
         if options.video is not None:
             self._drawable(UNDISTURBED, check=True).close()
         self.directory = options.out or self.file.parent / "evaluation"
+        _make_folder("--out", self.directory)
+        if options.video is not None:
+            _make_folder("--video", options.video.parent)
         self.outcomes: dict[Setting, dict[str, Outcome]] = {}
         self.header: Sequence[str] = HEADER
+
+    def _made(self) -> gym.Env:
+        try:
+            return self.environment.make(UNDISTURBED)
+        except TypeError as error:
+            raise ValueError(f"--env-kwargs: {self.environment.env_id} can't be made with its arguments: {error}") from error
 
     def run(self) -> None:
         """Evaluate, and print the table as it grows."""
@@ -225,7 +231,6 @@ class Evaluation:
 
         :param command: command line that made the results
         """
-        self.directory.mkdir(parents=True, exist_ok=True)
         lines = [self._row(*of) for of in self._all()]
         (self.directory / "evaluation.md").write_text(f"{self.title}\n\n{in_columns(self.header, lines)}\n\n{LEGEND}\n")
         labels = {name: f"{name} (reads {', '.join(policy.entries)})" for name, policy in self.policies.items()}
@@ -256,7 +261,6 @@ class Evaluation:
         :return: description of the video, in words
         """
         worst = min(self.outcomes, key=lambda setting: self.outcomes[setting]["learner"].mean.mean)
-        path.parent.mkdir(parents=True, exist_ok=True)
         env = self._drawable(worst)
         total = film(self.policies["learner"], env, self.options.seed, str(worst), path)
         env.close()
@@ -270,6 +274,13 @@ class Evaluation:
         if check:
             check_can_film(env, self.environment.env_id)
         return env
+
+
+def _make_folder(option: str, folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{option}: the folder {folder} can't be made: {error}") from None
 
 
 def _cells(texts: Sequence[str]) -> str:
@@ -286,20 +297,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parse_arguments(arguments)
     if options.video is not None and "DISPLAY" not in os.environ and find_library("EGL") is not None:
         os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is first imported
+    with StoppedInALine(), one_thread():
+        _evaluate(options, shlex.join(["python", "-m", "sb3_gac.evaluate", *arguments]))
+
+
+def _evaluate(options: argparse.Namespace, command: str) -> None:
     try:
         evaluation = Evaluation(options)
-    except (ValueError, FileNotFoundError, ImportError, RuntimeError, gym.error.Error) as error:
+    except (ValueError, OSError, ImportError, RuntimeError, gym.error.Error) as error:
         sys.exit(str(error))
-    try:
-        with one_thread():
-            evaluation.run()
-            evaluation.save(shlex.join(["python", "-m", "sb3_gac.evaluate", *arguments]))
-            print(f"Saved in {evaluation.directory}: evaluation.md, evaluation.png, evaluation.json.")
-            if options.video is not None:
-                print(evaluation.film_worst(options.video))
-    except KeyboardInterrupt:
-        print("\nStopped.", file=sys.stderr)
-        sys.exit(130)
+    evaluation.run()
+    evaluation.save(command)
+    print(f"Saved in {evaluation.directory}: evaluation.md, evaluation.png, evaluation.json.")
+    if options.video is not None:
+        print(evaluation.film_worst(options.video))
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """
-Ctrl-C in the main job: from the first import on, it ends the program with one line that says how to go on.
+Ctrl-C in the main job: from the first import on, it ends the program with one line that says how to go on.  It ends the
+other programs with one line as well.
 
 By default Python raises an exception, which may come in the middle of another library's import, of a destructor or of a
 callback, where it is swallowed or turned into another error.  This module is imported before all others, and imports
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
     from types import FrameType
 
 MODULE, SCRIPT = "sb3_gac.train", ("sb3-gac", "train")
+#: Words that start the main job in a process of Python
+_OF_PYTHON = (("-m", MODULE), ("-m", "sb3_gac", "train"))
+#: Modules of other programs, whose functions ``main`` end with :class:`StoppedInALine`
+_OTHERS = ("sb3_gac", "sb3_gac.evaluate", "sb3_gac.deploy", "sb3_gac.compare", "sb3_gac.zoo")
 INTERRUPTED = 128 + signal.SIGINT
 
 
@@ -27,10 +32,11 @@ def started_as(words: Sequence[str]) -> list[str] | None:
     :param words: words of a process's command line
     :return: words that start the main job, without its options; ``None`` if the process is another program
     """
-    for number, (word, following) in enumerate(pairwise(words)):
-        if (word, following) == ("-m", MODULE):
-            return list(words[: number + 2])
-        if (os.path.basename(word).removesuffix(".exe"), following) == SCRIPT:
+    for number, word in enumerate(words):
+        for start in _OF_PYTHON:
+            if tuple(words[number : number + len(start)]) == start:
+                return list(words[: number + len(start)])
+        if (os.path.basename(word).removesuffix(".exe"), *words[number + 1 : number + 2]) == SCRIPT:
             return list(SCRIPT)
     return None
 
@@ -87,6 +93,30 @@ def end_at_once(number: int, frame: "FrameType | None") -> None:
 
 
 def take_over() -> None:
-    """Handle Ctrl-C from now on, in a process of the main job that does not handle it otherwise."""
-    if started_as(sys.orig_argv) is not None and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    """Handle Ctrl-C from now on, in a process of one of this package's programs that does not handle it otherwise."""
+    is_ours = started_as(sys.orig_argv) is not None or _is_other(sys.orig_argv)
+    if is_ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, end_at_once)
+
+
+def _is_other(words: Sequence[str]) -> bool:
+    started = [following for word, following in pairwise(words) if word == "-m"]
+    scripts = [os.path.basename(word).removesuffix(".exe") for word in words[:2]]
+    return SCRIPT[0] in scripts or bool(started and started[0] in _OTHERS)
+
+
+class StoppedInALine:
+    """
+    A context around a program other than the main job, in which Ctrl-C ends the program with one line, not with a traceback.
+
+    At its start, imports are over, and Ctrl-C raises Python's exception again, so that the program can close what it opened.
+    """
+
+    def __enter__(self) -> None:
+        if started_as(sys.orig_argv) is None and signal.getsignal(signal.SIGINT) is end_at_once:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def __exit__(self, kind: type[BaseException] | None, *others: object) -> None:
+        if kind is not None and issubclass(kind, KeyboardInterrupt):
+            sys.stderr.write("\nStopped.\n")
+            sys.exit(INTERRUPTED)

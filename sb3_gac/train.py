@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with warnings_in_a_line():
             try:
                 job = prepare(options)
-            except ValueError as error:
+            except (OSError, TypeError, ValueError) as error:
                 sys.exit(f"python -m sb3_gac.train: error: {error}")
             run(job)
     except KeyboardInterrupt:

@@ -25,6 +25,7 @@ from sb3_gac.algorithms import ALGORITHMS, algorithm_class, name_of
 from sb3_gac.envs.suites import SUITES
 from sb3_gac.envs.suites.extras import missing_extra
 from sb3_gac.presets import merge, read_preset
+from sb3_gac.stopping import StoppedInALine
 
 try:
     import optuna
@@ -191,11 +192,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
     own, options = parser.parse_known_args(list(sys.argv[1:] if arguments is None else arguments)[:1])
     options = list(sys.argv[2:] if arguments is None else arguments[1:])
     register()
-    with TemporaryDirectory() as directory:
+    with StoppedInALine(), TemporaryDirectory() as directory:
         if own.script == "train":
+            _check_teacher(options)
             options = with_hyperparameters(options, Path(directory))
         sys.argv = [f"{sys.argv[0]} {own.script}", *options]
         SCRIPTS[own.script]()
+
+
+def _check_teacher(options: Sequence[str]) -> None:
+    known = _known(options)
+    has_one = known.algo in ALGORITHMS and "teacher" in algorithm_class(known.algo).frozen_arguments  # type: ignore[attr-defined]
+    if has_one and known.conf_file is None and not any(word.startswith("teacher:") for word in options):
+        sys.exit(
+            f"--algo {known.algo}: it learns from a teacher, a model that was trained before. Train one, such as with --algo "
+            "gac, and give -params teacher:\"'logs/gac/<its directory>/<its file>.zip'\"."
+        )
+
+
+def _known(options: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo")
+    parser.add_argument("-conf", "--conf-file")
+    return parser.parse_known_args(list(options))[0]
 
 
 def with_hyperparameters(options: list[str], directory: Path) -> list[str]:
@@ -206,10 +225,7 @@ def with_hyperparameters(options: list[str], directory: Path) -> list[str]:
     :param directory: directory for the file, which rl_zoo3 reads, and saves with the model
     :return: options with ``--conf-file`` added, if they name an algorithm of this package and no such file
     """
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--algo")
-    parser.add_argument("-conf", "--conf-file")
-    known, _ = parser.parse_known_args(options)
+    known = _known(options)
     if known.conf_file is not None or known.algo not in ALGORITHMS:
         return options
     path = directory / f"{known.algo}.yml"

@@ -113,6 +113,17 @@ def test_an_extra_that_is_missing_is_a_sentence_and_a_module_that_is_missing_an_
         main(["zoo", "train"])
 
 
+def test_a_program_that_is_stopped_says_so_in_a_line(monkeypatch, capsys):
+    def stopped(name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sb3_gac.__main__, "import_module", stopped)
+    with pytest.raises(SystemExit) as end:
+        main(["evaluate"])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "\nStopped.\n"
+
+
 def test_a_model_is_exported_by_a_command(tmp_path, capsys, monkeypatch):
     small_model().save(tmp_path / "model.zip")
     main(["export", str(tmp_path), str(tmp_path / "x.pt"), "--unit", "action=N m"])
@@ -122,7 +133,8 @@ def test_a_model_is_exported_by_a_command(tmp_path, capsys, monkeypatch):
         ("nowhere", "x.pt"): "no file or directory",
         (tmp_path, tmp_path / "x.tar"): r'must end in "\.onnx"',
         (tmp_path, tmp_path / "x.pt", "--unit", "privileged=m"): "units names",
-        (tmp_path, tmp_path / "x.pt", "--vec-normalize", "nowhere"): "--vec-normalize: there is no file nowhere",
+        (tmp_path, tmp_path / "x.pt", "--vec-normalize", "nowhere"): "the model was trained without VecNormalize",
+        (tmp_path, tmp_path / "x.pt" / "y.pt"): "x.pt",
     }
     for arguments, message in wrong.items():
         with pytest.raises(SystemExit, match=message):
@@ -130,9 +142,14 @@ def test_a_model_is_exported_by_a_command(tmp_path, capsys, monkeypatch):
     with pytest.raises(SystemExit):
         main(["export", str(tmp_path), "x.pt", "--unit", "action"])
     assert "--unit: must be ENTRY=UNIT" in capsys.readouterr().err
+    (tmp_path / "folder.pt").mkdir()
+    with pytest.raises(SystemExit):
+        main(["export", str(tmp_path), str(tmp_path / "folder.pt")])
+    assert "folder.pt is a directory: name a file in it" in capsys.readouterr().err
 
 
-def test_an_exported_policy_has_the_statistics_of_vec_normalize(tmp_path):
+@pytest.mark.parametrize("is_beside", [False, True])
+def test_an_exported_policy_has_the_statistics_of_vec_normalize(is_beside, tmp_path):
     import numpy as np
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -144,11 +161,43 @@ def test_an_exported_policy_has_the_statistics_of_vec_normalize(tmp_path):
     env.obs_rms["partial"].mean[:], env.obs_rms["partial"].var[:] = 2.0, 9.0
     model.save(tmp_path / "model")
     env.save(str(tmp_path / "statistics.pkl"))
-    with pytest.raises(SystemExit, match="VecNormalize normalised, but was loaded without it"):
-        main(["export", str(tmp_path), str(tmp_path / "x.pt")])
-    main(["export", str(tmp_path), str(tmp_path / "x.pt"), "--vec-normalize", str(tmp_path / "statistics.pkl")])
+    export = ["export", str(tmp_path), str(tmp_path / "x.pt")]
+    with pytest.raises(SystemExit, match=r"there is no vecnormalize\.pkl beside .*: pass --vec-normalize"):
+        main(export)
+    for missing in ("nowhere", str(tmp_path)):
+        with pytest.raises(SystemExit, match=f"--vec-normalize: there is no file {missing}"):
+            main([*export, "--vec-normalize", missing])
+    main([*export, "--vec-normalize", str(tmp_path / "statistics.pkl")])
+    if is_beside:
+        (tmp_path / "x.pt").unlink()
+        (tmp_path / "statistics.pkl").rename(tmp_path / "vecnormalize.pkl")
+        main(export)
     policy = load_exported(tmp_path / "x.pt")
     policy.start(1)
     raw = np.array([[5.0, -1.0]], np.float32)
     expected, _ = model.predict({"partial": (raw - 2) / 3}, deterministic=True)
     np.testing.assert_allclose(policy.act({"partial": raw}, np.ones(1, bool)), expected, atol=1e-4)
+
+
+def test_all_entries_that_a_policy_reads_are_normalised_in_its_file(tmp_path):
+    import numpy as np
+    from gymnasium import spaces
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    from sb3_gac.evaluation.policies import load_exported
+    from tests.helpers import Sampled
+
+    entries = spaces.Dict({name: spaces.Box(-9, 9, (2,), np.float32) for name in ("partial", "privileged", "proprio")})
+    env = VecNormalize(DummyVecEnv([lambda: Sampled(entries)]))
+    arguments = {"role_keys": {"learner": ["partial", "proprio"]}, "policy_kwargs": {"net_arch": [4]}, "device": "cpu"}
+    model = GAC("MultiInputPolicy", env, buffer_size=100, **arguments).learn(5)
+    env.obs_rms["proprio"].mean[:], env.obs_rms["proprio"].var[:] = 2.0, 9.0
+    model.save(tmp_path / "model")
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    main(["export", str(tmp_path), str(tmp_path / "x.pt")])
+    policy = load_exported(tmp_path / "x.pt")
+    policy.start(1)
+    raw = {name: np.array([[5.0, -1.0]], np.float32) for name in entries.spaces}
+    expected, _ = model.predict(env.normalize_obs(raw), deterministic=True)
+    found = policy.act({name: raw[name] for name in policy.entries}, np.ones(1, bool))
+    np.testing.assert_allclose(found, expected, atol=1e-4)

@@ -19,7 +19,7 @@ ROOMS = {
     "replay": "replay|checks",
     "checkpoint": "checkpoint|envs",
     "base": "algorithms|base|math|checks|schedules|optim|networks|replay|checkpoint|envs",
-    "deploy": "deploy|base|checks|networks|envs|learner|version",
+    "deploy": "deploy|base|checks|networks|envs|learner|version|stopping|training\\.environments",
     "evaluation": "evaluation|algorithms|base|envs|learner|training\\.environments",
 }
 DRAWING = "page|intervals|bootstrap|tidy"
@@ -33,7 +33,7 @@ FORBIDDEN = {
         for pattern in ("{}.py", "{}/**/*.py")
     },
     **{f"sb3_gac/{path}.py": r"mujoco\b" for path in ("evaluate", "evaluation/*")},  # before MUJOCO_GL is set
-    "sb3_gac/__main__.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac(?!\.version\b)",
+    "sb3_gac/__main__.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac(?!\.(stopping|version)\b)",
     "sb3_gac/tabular/**/*.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac(?!\.tabular\b)",
     "sb3_gac/schedules.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "sb3_gac/algorithms.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",

@@ -194,8 +194,11 @@ def test_names_of_activations_and_optimisers_become_classes():
     kwargs = preset("paper")["policy_kwargs"]
     assert (kwargs["activation_fn"], kwargs["optimizer_class"]) == (th.nn.SiLU, th.optim.Adam)
     assert preset("paper", policy_kwargs={"activation_fn": th.nn.Tanh})["policy_kwargs"]["activation_fn"] is th.nn.Tanh
+    assert preset("paper", policy_kwargs={"activation_fn": "ReLU"})["policy_kwargs"]["activation_fn"] is th.nn.ReLU
     with pytest.raises(ValueError, match=r"activation_fn must name a class of torch\.nn, got 'silu'"):
-        instantiate({"policy_kwargs": {"activation_fn": "silu"}})
+        preset("small", policy_kwargs={"activation_fn": "silu"})
+    with pytest.raises(ValueError, match=r"policy_kwargs: must be a mapping, got \[1\]"):
+        instantiate({"policy_kwargs": [1]})
 
 
 @pytest.mark.parametrize(

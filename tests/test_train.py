@@ -5,6 +5,7 @@ import re
 import shlex
 import signal
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
@@ -258,6 +259,83 @@ def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "lacks task, steps, seed, environment"),
+        ("[1, 2]", "lacks task, steps, seed, environment"),
+        (
+            "run: {algorithm: gac, task: Hopper}\narguments: {}\ncommit: ''",
+            "is no run of sb3_gac.train: its config.yaml lacks",
+        ),
+        ("task: {", "config.yaml is no YAML"),
+        ("{task: Hopper, steps: 9, seed: 0, environment: {}, preset: large}", "preset must be one of"),
+        ("{task: Nothing, steps: 9, seed: 0, environment: {}}", "task must be one of"),
+    ],
+)
+def test_a_directory_of_something_else_is_no_run_and_stays_as_it_is(content, message, tmp_path, capsys):
+    (tmp_path / "config.yaml").write_text(content)
+    with pytest.raises(SystemExit):
+        parse_arguments(["--resume", str(tmp_path)])
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
+    assert (tmp_path / "config.yaml").read_text() == content
+
+
+def test_a_run_is_one_processs_alone_and_has_its_configuration_from_its_start(tmp_path):
+    new = ["--task", "InvertedDoublePendulum", "--envs", "1", "--runs", str(tmp_path)]
+    begun = prepare(parse_arguments(new))
+    configuration = begun.directory / "config.yaml"
+    configuration.write_text(f"# mine\n{configuration.read_text()}")
+    resumed = parse_arguments(["--resume", str(begun.directory)])
+    with pytest.raises(ValueError, match=r"--resume: Another process is running .* Wait until"):
+        prepare(resumed)
+    with begun.alone:
+        pass
+    with prepare(resumed).alone, pytest.raises(ValueError, match="Another process is running"):
+        prepare(resumed)
+    assert configuration.read_text().startswith("# mine\n"), "no checkpoint is no reason to write it again"
+    (begun.directory / "results.json").write_text("{}")
+    with pytest.raises(ValueError, match="this run is finished"):
+        prepare(resumed)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env-kwargs", "{foo: 2}"], "sb3_gac/InvertedDoublePendulum-v5: .*unexpected keyword argument 'foo'"),
+        (["--overrides", "{gama: 0.9}"], 'Is "gamma" meant'),
+        (["--overrides", "{task: 3}"], 'got "task", which is no argument of GAC'),
+        (["--overrides", "{policy_kwargs: {net_arhc: [8]}}"], "net_arhc"),
+        (["--overrides", "{policy_kwargs: [1]}"], "policy_kwargs: must be a mapping, got"),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_nothing_is_written(arguments, message, tmp_path):
+    with pytest.raises(SystemExit, match=rf"^python -m sb3_gac.train: error: .*{message}"):
+        main([*QUICK, *arguments, "--runs", str(tmp_path)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_directory_that_can_not_be_made_is_one_line(monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(job, "write_configuration", full)
+    with pytest.raises(SystemExit, match=r"error: .*No space left"):
+        main(QUICK)
+
+
+def test_a_model_that_could_not_be_written_whole_is_none(tmp_path):
+    def save(path):
+        path.write_text("half of it")
+        raise OSError(28, "No space left on device")
+
+    model = SimpleNamespace(save=save)
+    with pytest.raises(OSError, match="No space left"):
+        finish(Job(parse_arguments([]), tmp_path, model, None), [], 1.5)
+    assert not (tmp_path / "model.zip").exists()
+
+
 @pytest.mark.parametrize(("asked", "taken"), [(2, 2), (12, 5)])
 def test_evaluations_on_the_way_have_five_episodes_at_most(asked, taken, tmp_path, monkeypatch):
     numbers = []
@@ -280,7 +358,7 @@ def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_pat
         asked.append((type(policy).__name__, n_eval_episodes, env.seeds.pop()))
         return {"PartialOnly": (1.0, 2.0), "UniformActions": (3.0, 4.0)}[asked[-1][0]]
 
-    model = SimpleNamespace(save=lambda path: None, num_timesteps=7, compiles=True, learning_starts=5)
+    model = SimpleNamespace(save=Path.touch, num_timesteps=7, compiles=True, learning_starts=5)
     space = SimpleNamespace(seed=lambda seed: None)
     seeds, drawn = [], []
     env = SimpleNamespace(seeds=seeds, seed=seeds.append, action_space=space, num_envs=1)

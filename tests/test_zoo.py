@@ -48,6 +48,12 @@ def _train(zoo, algorithm, *options):
     return zoo("train", "--algo", algorithm, "--env", ENV, *WITH_NOISE, *options, *_small(algorithm))
 
 
+@pytest.mark.parametrize("algorithm", [name for name in LINES if is_taught(name)])
+def test_an_algorithm_with_a_teacher_asks_for_it(algorithm, zoo):
+    with pytest.raises(SystemExit, match=rf"--algo {algorithm}: it learns from a teacher.*-params teacher:"):
+        zoo("train", "--algo", algorithm, "--env", ENV)
+
+
 @pytest.fixture(scope="module", params=list(LINES))
 def trained(request, zoo):
     """An algorithm that was trained for a moment, and the folder of its files."""

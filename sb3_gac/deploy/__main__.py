@@ -7,7 +7,6 @@ The file's actions are compared with those of the model before the file is writt
 """
 
 import argparse
-import pickle
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +15,8 @@ from sb3_gac.base.loading import load_model, model_file
 from sb3_gac.deploy.export import WRITERS, export_learner
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import ExportError
+from sb3_gac.stopping import StoppedInALine
+from sb3_gac.training.environments import STATISTICS, read_statistics, statistics_of
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -27,7 +28,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path, help="a run's directory, or a model's zip")
     parser.add_argument("out", type=Path, help=f"the file to write, with the suffix {' or '.join(WRITERS)}")
-    parser.add_argument("--vec-normalize", type=Path, metavar="FILE", help="statistics of VecNormalize, as it saved them")
+    parser.add_argument(
+        "--vec-normalize",
+        type=Path,
+        metavar="FILE",
+        help=f"statistics of VecNormalize, as it saved them (default: {STATISTICS} beside the model)",
+    )
     parser.add_argument(
         "--unit", action="append", default=[], metavar="ENTRY=UNIT", help="of an entry, or of the action; may be repeated"
     )
@@ -36,21 +42,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if malformed:
         parser.error(f"--unit: must be ENTRY=UNIT, such as action=Nm, got {malformed[0]!r}.")
     units = dict(text.split("=", 1) for text in options.unit)
-    try:
-        model = load_model(model_file(options.model), device="cpu")
-        normalizer = None if options.vec_normalize is None else _normalizer(options.vec_normalize)
-        path = export_learner(model, options.out, normalizer, units)
-    except (ValueError, FileNotFoundError, ImportError, ExportError) as error:
-        sys.exit(str(error))
-    reads = " and ".join(model.policy.role_keys[model.policy.roles.deployed])
-    print(f"Wrote {path}: the deployed policy of {type(model).__name__}, which reads {reads}; its actions were compared.")
+    if options.out.is_dir():
+        parser.error(f"out: {options.out} is a directory: name a file in it, such as {options.out / 'policy.onnx'}.")
+    with StoppedInALine():
+        try:
+            print(_export(options, units))
+        except (ValueError, OSError, ImportError, ExportError) as error:
+            sys.exit(str(error))
 
 
-def _normalizer(path: Path) -> DeploymentNormalizer:
-    if not path.is_file():
-        raise FileNotFoundError(f"--vec-normalize: there is no file {path}.")
-    with path.open("rb") as file:
-        return DeploymentNormalizer.from_vec_normalize(pickle.load(file))
+def _export(options: argparse.Namespace, units: dict[str, str]) -> str:
+    file = model_file(options.model)
+    model = load_model(file, device="cpu")
+    reads = model.policy.role_keys[model.policy.roles.deployed]
+    statistics, normalizer = statistics_of(model, file, options.vec_normalize), None
+    if statistics is not None:
+        normalizer = DeploymentNormalizer.from_vec_normalize(read_statistics(statistics, model), reads)
+    path = export_learner(model, options.out, normalizer, units)
+    policy = f"the deployed policy of {type(model).__name__}, which reads {' and '.join(reads)}"
+    return f"Wrote {path}: {policy}; its actions were compared."
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ Print the registered environments with suites, shapes and installation; with ``-
 """
 
 import argparse
+import sys
 
 from sb3_gac.envs.table import Row, in_columns, rows, steps_per_second
 
@@ -19,12 +20,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m sb3_gac.envs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("matching", nargs="?", default="", help="only ids that contain this")
+    parser.add_argument("matching", nargs="?", default="", help="only ids that contain this, in small or capital letters")
     parser.add_argument("--speed", action="store_true", help="measure those that are installed")
     parser.add_argument("--envs", type=int, nargs="+", default=[1, 16], metavar="N", help="side by side, with --speed")
     parser.add_argument("--seconds", type=float, default=1.0, help="of each measurement")
     options = parser.parse_args(arguments)
+    if min(options.envs) < 1:
+        parser.error(f"--envs: must be integers of at least 1, got {min(options.envs)}.")
+    if not options.seconds > 0:
+        parser.error(f"--seconds: must be above 0, got {options.seconds:g}.")
     found = list(rows(options.matching))
+    if not found:
+        sys.exit(f"None of the registered environments' ids contains {options.matching!r}; without it, all are listed.")
     numbers = options.envs if options.speed else []
     header = ["id", *Row._fields[1:], *(f"steps/s, {number}" for number in numbers)]
     lines = [[*row, *(_speed(row, number, options.seconds) for number in numbers)] for row in found]

@@ -38,12 +38,12 @@ def rows(matching: str = "") -> Iterator[Row]:
     """
     List the registered environments.
 
-    :param matching: text that ids must contain; the empty text for all environments
+    :param matching: text that ids must contain, in small or capital letters; the empty text for all environments
     :return: rows, suite by suite; an environment whose shapes are not recorded is made, if its simulator is installed
     """
     for name, suite in SUITES.items():
         for env_id, arguments in suite.environments.items():
-            if matching in env_id:
+            if matching.casefold() in env_id.casefold():
                 installed = "yes" if suite.is_installed else _how_to_install(suite)
                 yield Row(env_id, name, *_shapes(env_id, suite, arguments.get("shapes")), installed)
 

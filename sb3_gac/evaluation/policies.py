@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
+from sb3_gac.training.environments import read_statistics, statistics_of
 
 Observations = Mapping[str, np.ndarray]
 Shapes = dict[str, tuple[int, ...]]
@@ -195,28 +195,20 @@ def _shapes(model: AsymmetricAlgorithm, roles: Sequence[str]) -> Shapes:
     return {key: tuple(model.observation_space[key].shape or ()) for key in keys}
 
 
-def normalizer_of(model: AsymmetricAlgorithm, statistics: Path | None, env: Any) -> Callable[[Any], Any] | None:
+def normalizer_of(model: AsymmetricAlgorithm, file: Path, given: Path | None) -> Callable[[Any], Any] | None:
     """
     Find the normalisation that a model's observations need.
 
     :param model: trained model, which knows whether it learned from normalised observations
-    :param statistics: file that ``VecNormalize.save`` wrote, ``None`` for no file
-    :param env: environment that the observations come from
+    :param file: file of the model
+    :param given: file that ``VecNormalize.save`` wrote, ``None`` for that beside the model
     :return: function that normalises a batch of observations as ``VecNormalize`` did in training, ``None`` if the model was
         trained without
     :raises ValueError: if a file is given for a model trained without ``VecNormalize``, or no file for one trained with it
     :raises FileNotFoundError: if there is no such file
     """
-    if not model.trained_normalised:
-        if statistics is not None:
-            raise ValueError("--vec-normalize: the model was trained without VecNormalize, or on observations as they are.")
-        return None
+    statistics = statistics_of(model, file, given)
     if statistics is None:
-        raise ValueError(
-            "The model learned from observations that VecNormalize normalised: pass --vec-normalize with the file that "
-            "VecNormalize.save wrote."
-        )
-    if not statistics.exists():
-        raise FileNotFoundError(f"--vec-normalize: there is no file {statistics}.")
-    normalize: Callable[[Any], Any] = VecNormalize.load(str(statistics), DummyVecEnv([lambda: env])).normalize_obs
+        return None
+    normalize: Callable[[Any], Any] = read_statistics(statistics, model).normalize_obs
     return normalize

@@ -157,22 +157,33 @@ def _of_batch(env_id: str) -> Mapping[str, inspect.Parameter]:
     return parameters
 
 
-def environment_of_run(directory: Path) -> Environment:
+def environment_of_run(directory: Path) -> Environment | None:
     """
     Read from a run's configuration in which environment it was trained.
 
     :param directory: folder of a run of ``sb3_gac.train``, or of the benchmarks
-    :return: environment of the run's training
+    :return: environment of the run's training; ``None`` if the folder has no configuration of a run
     """
-    configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
-    run = configuration.get("run", configuration)
+    run = _configuration(directory / CONFIGURATION)
     made = run.get("environment")
-    if made is not None:
+    if isinstance(made, Mapping) and {"id", "kwargs"} <= made.keys():
         return Environment(made["id"], made["kwargs"], made.get("wrappers", ()))
+    if made is not None or not {"task", "noise"} <= run.keys():
+        return None
     given = {"noise_std": run["noise"], "history": run.get("history"), "privileged": run.get("privileged")}
     usual = {"history": 1, "privileged": "state"}  # not every environment has these arguments
     kwargs = {name: value for name, value in given.items() if value not in (None, usual.get(name))}
     return Environment(env_id_of(run["task"]), kwargs)
+
+
+def _configuration(path: Path) -> Mapping[str, Any]:
+    """Settings of a run, empty where the file is missing or holds something else."""
+    try:
+        content = yaml.safe_load(path.read_text()) if path.is_file() else None
+    except (UnicodeDecodeError, yaml.YAMLError):
+        return {}
+    run = content.get("run", content) if isinstance(content, Mapping) else None
+    return run if isinstance(run, Mapping) else {}
 
 
 def check_fits(entries: Mapping[str, tuple[int, ...]], env: gym.Env, name: str) -> None:

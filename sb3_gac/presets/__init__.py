@@ -198,16 +198,17 @@ def preset(
     :param task: task of an environment that is registered as ``sb3_gac/<task>-v5`` or ``sb3_gac/brax-<task>-v0``, or its id,
         whose arguments in the preset count as well; ``None`` for any other environment
     :param noise: standard deviation of the task's sensor noise; see :meth:`Preset.layers` for levels that the preset lacks
-    :param overrides: arguments that replace those of the preset; ``policy_kwargs`` are merged
+    :param overrides: arguments that replace those of the preset; ``policy_kwargs`` are merged. Activation functions and
+        optimisers are classes, or names of torch's
     :return: keyword arguments of the algorithm, ``policy`` included where the preset has it
-    :raises ValueError: if there is no such preset, algorithm or task, or the noise is negative
+    :raises ValueError: if there is no such preset, algorithm, task or class of torch's, or the noise is negative
     """
     found = read_preset(name)
     kind = _kind(algorithm)
     resolved: dict[str, Any] = {"policy_kwargs": {}}
     for layer in found.layers(kind, task, noise):
         resolved = merge(resolved, layer)
-    return merge(instantiate(resolved), overrides | {"policy_kwargs": overrides.get("policy_kwargs") or {}})
+    return instantiate(merge(resolved, overrides | {"policy_kwargs": overrides.get("policy_kwargs") or {}}))
 
 
 def _class_of(algorithm: str) -> type:
@@ -221,15 +222,19 @@ def instantiate(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """
     Turn the names of torch's activation functions and optimisers into classes.
 
-    :param arguments: arguments of an algorithm, as read from YAML
+    :param arguments: arguments of an algorithm, as read from YAML; what is a class or a function already stays as it is
     :return: the arguments as the algorithm's class takes them
-    :raises ValueError: if torch has no class of a name
+    :raises ValueError: if torch has no class of a name, or ``policy_kwargs`` is no mapping
     """
-    policy_kwargs = dict(arguments.get("policy_kwargs") or {})
-    for key, library in _LIBRARIES.items():
-        if key in policy_kwargs:
-            found = getattr(library, str(policy_kwargs[key]), None)
-            if not isinstance(found, type):
-                raise ValueError(f"policy_kwargs: {key} must name a class of {library.__name__}, got {policy_kwargs[key]!r}.")
-            policy_kwargs[key] = found
-    return {**arguments, "policy_kwargs": policy_kwargs}
+    policy_kwargs = arguments.get("policy_kwargs") or {}
+    if not isinstance(policy_kwargs, Mapping):
+        raise ValueError(f"policy_kwargs: must be a mapping, got {policy_kwargs!r}.")
+    named = {key: name for key, name in policy_kwargs.items() if key in _LIBRARIES and not callable(name)}
+    return {**arguments, "policy_kwargs": {**policy_kwargs, **{key: _class_named(key, name) for key, name in named.items()}}}
+
+
+def _class_named(key: str, name: Any) -> type:
+    found = getattr(_LIBRARIES[key], str(name), None)
+    if not isinstance(found, type):
+        raise ValueError(f"policy_kwargs: {key} must name a class of {_LIBRARIES[key].__name__}, got {name!r}.")
+    return found

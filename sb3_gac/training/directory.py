@@ -19,7 +19,7 @@ from sb3_gac.envs.suites import SUITES, suite_of
 from sb3_gac.stopping import command
 from sb3_gac.training.environments import STATISTICS
 from sb3_gac.training.evaluation import EVAL_SEED
-from sb3_gac.training.options import DEFAULTS, name_of_run, resolve
+from sb3_gac.training.options import DEFAULTS, name_of_run, noise_in_words, resolve
 from sb3_gac.training.provenance import provenance
 
 CONFIGURATION, CHECKPOINTS, RESULTS, MODEL = "config.yaml", "checkpoints", "results.json", "model"
@@ -27,6 +27,7 @@ _OPTIONS = (
     *("task", "env", "env_kwargs", "whole_state", "noise", "privileged", "history", "algorithm", "teacher", "preset"),
     *("overrides", "steps", "seed", "envs", "compile", "episodes", "tensorboard", "runs"),
 )
+_REQUIRED = ("task", "steps", "seed", "environment")
 _PATHS = ("runs", "teacher")
 
 
@@ -38,18 +39,44 @@ def options_of(directory: Path) -> Namespace:
     :return: options of the run, with the directory as ``resume``
     :raises ValueError: if the run is finished, or the directory is none of a run
     """
-    if (directory / RESULTS).exists():
-        raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
-    if not (directory / CONFIGURATION).exists():
-        raise ValueError(f"--resume {directory}: there is no {CONFIGURATION} in it, so it is no run's directory.")
-    configuration = yaml.safe_load((directory / CONFIGURATION).read_text())
+    check_unfinished(directory)
+    configuration = _configuration(directory)
     given = {name: value for name, value in configuration.items() if name in _OPTIONS and value is not None}
     given = {name: value for name, value in given.items() if value != DEFAULTS.get(name)}
     given |= {name: Path(given[name]) for name in _PATHS if name in given}
     given.setdefault("history", 1)  # runs of earlier versions had no history
     if "env" in given:
         given.pop("task", None)
-    return Namespace(**vars(resolve(given)) | {"resume": directory})
+    try:
+        return Namespace(**vars(resolve(given)) | {"resume": directory})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"--resume {directory}: {CONFIGURATION}: {error}") from error
+
+
+def check_unfinished(directory: Path) -> None:
+    """
+    :param directory: directory of a run that is to be resumed
+    :raises ValueError: if the run is finished
+    """
+    if (directory / RESULTS).exists():
+        raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
+
+
+def _configuration(directory: Path) -> Mapping[str, Any]:
+    path = directory / CONFIGURATION
+    if not path.is_file():
+        raise ValueError(f"--resume {directory}: there is no {CONFIGURATION} in it, so it is no run's directory.")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"--resume {directory}: {CONFIGURATION} is no YAML: {error}") from None
+    missing = [name for name in _REQUIRED if name not in content] if isinstance(content, Mapping) else _REQUIRED
+    if missing:
+        raise ValueError(
+            f"--resume {directory}: this is no run of sb3_gac.train: its {CONFIGURATION} lacks {', '.join(missing)}. "
+            "A run of the benchmarks goes on by the command that started it."
+        )
+    return content
 
 
 def new_directory(options: Namespace) -> Path:
@@ -66,7 +93,7 @@ def write_configuration(directory: Path, options: Namespace, model: Any) -> None
     """
     Write down all that it takes to repeat a run: options, arguments, seeds, versions and commit.
 
-    :param directory: directory of the run, which is made if it does not exist
+    :param directory: directory of the run, which is made
     :param options: options of the run, see :func:`resolve`
     :param model: model that the run trains
     """
@@ -84,7 +111,7 @@ def write_configuration(directory: Path, options: Namespace, model: Any) -> None
         "device": str(model.device),
         **provenance(simulators),
     }
-    directory.mkdir(parents=True, exist_ok=True)
+    directory.mkdir(parents=True)  # and fails if another run has taken the name meanwhile
     write_at_once(directory / CONFIGURATION, yaml.safe_dump(configuration, sort_keys=False))
 
 
@@ -166,7 +193,7 @@ def in_words(options: Namespace) -> str:
     :param options: options of the run, see :func:`resolve`
     :return: text with the environment's id, and its noise and history if it has them
     """
-    noise = "" if options.noise is None else f"noise {options.noise:g}"
+    noise = "" if options.noise is None else f"noise {noise_in_words(options.noise).lstrip()}"
     history = "" if options.history == 1 else f"history {options.history}"
     details = ", ".join(filter(None, [noise, history]))
     return f"{options.env_id} ({details})" if details else str(options.env_id)

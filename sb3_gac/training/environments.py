@@ -1,10 +1,12 @@
 """Environments by name, with arguments and wrappers: this package's, any of gymnasium's, or a module's own."""
 
 import os
+import pickle
 import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -107,6 +109,58 @@ def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = 
     :return: environments in a ``VecNormalize``, or as they were
     """
     return env if options is None else VecNormalize(env, **{"norm_reward": False, "training": training, **options})
+
+
+def statistics_of(model: Any, file: Path, given: Path | None) -> Path | None:
+    """
+    Find the file with the statistics of ``VecNormalize`` that a model's observations need.
+
+    :param model: trained model, which knows whether it learned from normalised observations
+    :param file: file of the model
+    :param given: file that the option ``--vec-normalize`` names; ``None`` for that beside the model
+    :return: path of the statistics' file; ``None`` if the model was trained without ``VecNormalize``
+    :raises ValueError: if a file is given for a model trained without ``VecNormalize``, or one trained with it has none
+    :raises FileNotFoundError: if there is no file of the given name
+    """
+    if not model.trained_normalised:
+        if given is not None:
+            raise ValueError("--vec-normalize: the model was trained without VecNormalize, or on observations as they are.")
+        return None
+    beside = file.parent / STATISTICS
+    if given is None and not beside.is_file():
+        raise ValueError(
+            f"The model learned from observations that VecNormalize normalised, and there is no {STATISTICS} beside {file}: "
+            "pass --vec-normalize with the file that VecNormalize.save wrote."
+        )
+    if given is not None and not given.is_file():
+        raise FileNotFoundError(f"--vec-normalize: there is no file {given}.")
+    return given or beside
+
+
+def read_statistics(path: Path, model: Any) -> VecNormalize:
+    """
+    :param path: path of a file that ``VecNormalize.save`` wrote
+    :param model: model whose observations are to be normalised
+    :return: what was saved, without environments
+    :raises ValueError: if the file holds something else, or statistics of other observations
+    """
+    try:
+        with path.open("rb") as file:
+            found = pickle.load(file)
+    except OSError:
+        raise
+    except Exception as error:  # what bytes that are no pickle raise is as various as bytes are
+        raise ValueError(f"--vec-normalize: {path} is no file that VecNormalize.save wrote: {error}") from None
+    if not isinstance(found, VecNormalize):
+        raise ValueError(f"--vec-normalize: {path} holds {type(found).__name__}, not what VecNormalize.save writes.")
+    for key, space in model.observation_space.spaces.items():
+        of_key = found.obs_rms.get(key) if isinstance(found.obs_rms, dict) else None
+        if of_key is not None and sorted(of_key.mean.shape) != sorted(space.shape):  # images may have their channels first
+            raise ValueError(
+                f'--vec-normalize: {path} is of another environment: its "{key}" has the shape {of_key.mean.shape}, and the '
+                f"model's {space.shape}."
+            )
+    return found
 
 
 def find_modules_here() -> None:

@@ -5,6 +5,7 @@ import shutil
 import time
 import warnings
 from argparse import Namespace
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,13 +16,16 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_nor
 from sb3_gac import ExactCheckpointCallback, GuiderLearnerEvalCallback, SeededEvalCallback
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.checkpoint.files import checkpoints
+from sb3_gac.checkpoint.lock import locked
 from sb3_gac.presets import PRESETS
 from sb3_gac.stopping import when_stopped_say
 from sb3_gac.training.curve import draw_learning_curve
 from sb3_gac.training.directory import (
     CHECKPOINTS,
+    CONFIGURATION,
     MODEL,
     RESULTS,
+    check_unfinished,
     how_to_go_on,
     in_words,
     new_directory,
@@ -44,12 +48,14 @@ class Job(NamedTuple):
     :param directory: directory that everything is saved in
     :param model: model to train, new or from its last checkpoint
     :param eval_env: vectorised environments to evaluate in
+    :param alone: context in which no other process makes the run
     """
 
     options: Namespace
     directory: Path
     model: Any
     eval_env: VecEnv
+    alone: AbstractContextManager[Any] = nullcontext()
 
 
 def prepare(options: Namespace) -> Job:
@@ -58,21 +64,40 @@ def prepare(options: Namespace) -> Job:
 
     :param options: options of the run, see :func:`sb3_gac.training.options.resolve`
     :return: run that is ready to train
-    :raises ValueError: if the environment or an argument is wrong; then nothing was written
+    :raises ValueError: if the environment or an argument is wrong, or another process makes the run; then nothing was written
     """
     set_random_seed(options.seed)
     env, eval_env = open_environments(options)
-    directory = options.resume or new_directory(options)
+    with ExitStack() as held:
+        begin = _begun if options.resume is None else _taken_up
+        directory, model, goes_on = begin(options, env, held)
+        when_stopped_say(lambda: how_to_go_on(directory, options.steps))
+        name = type(model).__name__
+        begins = f"Going on after {model.num_timesteps:,} of" if goes_on else "Training for"
+        print(f"{begins} {options.steps:,} steps: {name} on {in_words(options)}. Ctrl-C stops, and says how to go on.")
+        print(f"All of it is in {directory}", flush=True)
+        return Job(options, directory, model, eval_env, held.pop_all())
+
+
+def _begun(options: Namespace, env: VecEnv, held: ExitStack) -> tuple[Path, Any, bool]:
+    """Directory and model of a new run, which the context keeps for this process."""
+    directory = new_directory(options)
+    model = _new(options, directory, env)
+    write_configuration(directory, options, model)
+    held.enter_context(locked(directory, CONFIGURATION))
+    return directory, model, False
+
+
+def _taken_up(options: Namespace, env: VecEnv, held: ExitStack) -> tuple[Path, Any, bool]:
+    """Directory and model of a run that was stopped, which the context keeps, and whether the run has a checkpoint."""
+    directory = options.resume
+    try:
+        held.enter_context(locked(directory, CONFIGURATION))
+    except RuntimeError as error:
+        raise ValueError(f"--resume: {error} Wait until that process has ended, or stop it.") from None
+    check_unfinished(directory)  # again, for another process may have finished the run since the options were read
     goes_on = bool(checkpoints(directory / CHECKPOINTS))
-    model = _resumed(options, directory, env) if goes_on else _new(options, directory, env)
-    if not goes_on:
-        write_configuration(directory, options, model)
-    when_stopped_say(lambda: how_to_go_on(directory, options.steps))
-    name = type(model).__name__
-    begins = f"Going on after {model.num_timesteps:,} of" if goes_on else "Training for"
-    print(f"{begins} {options.steps:,} steps: {name} on {in_words(options)}. Ctrl-C stops, and says how to go on.")
-    print(f"All of it is in {directory}", flush=True)
-    return Job(options, directory, model, eval_env)
+    return directory, _resumed(options, directory, env) if goes_on else _new(options, directory, env), goes_on
 
 
 def run(job: Job) -> None:
@@ -81,8 +106,9 @@ def run(job: Job) -> None:
 
     :param job: run that is ready to train, new or resumed
     """
-    history, minutes = learn(job)
-    finish(job, history, minutes)
+    with job.alone:
+        history, minutes = learn(job)
+        finish(job, history, minutes)
 
 
 def open_environments(options: Namespace) -> tuple[VecEnv, VecEnv]:
@@ -99,7 +125,7 @@ def open_environments(options: Namespace) -> tuple[VecEnv, VecEnv]:
     try:
         env = normalized(make_envs(*made, options.envs, options.seed), normalization)
         return env, normalized(make_envs(*made, min(EPISODES_ON_THE_WAY, options.episodes)), normalization, training=False)
-    except (ImportError, GymnasiumError, ValueError) as error:
+    except (ImportError, GymnasiumError, TypeError, ValueError) as error:
         raise ValueError(f"{options.env_id}: {error}") from error
 
 
@@ -122,7 +148,7 @@ def learn(job: Job) -> tuple[list[dict[str, float]], float]:
     :param job: run that is ready to train
     :return: results of the evaluations, and duration of training in minutes, earlier processes of the same run included
     """
-    options, directory, model, eval_env = job
+    options, directory, model, eval_env, _ = job
     every = max(options.steps // EVALUATIONS // options.envs, 1)
     evaluation = _evaluation_class(model)(
         eval_env, eval_seed=EVAL_SEED, eval_freq=every, n_eval_episodes=eval_env.num_envs, verbose=0
@@ -167,12 +193,12 @@ def finish(job: Job, history: list[dict[str, float]], minutes: float) -> None:
     :param history: results of the evaluations during training
     :param minutes: duration of training, in minutes
     """
-    options, directory, model, eval_env = job
-    model.save(directory / MODEL)
+    options, directory, model, eval_env, _ = job
     if isinstance(eval_env, VecNormalize):
         of_training = model.get_vec_normalize_env()
         of_training.save(str(directory / STATISTICS))
         sync_envs_normalization(of_training, eval_env)
+    _save(model, directory / f"{MODEL}.zip")
     learner, learner_std = evaluate(PartialOnly(model), eval_env, options.episodes)
     random, random_std = evaluate(UniformActions(eval_env), eval_env, options.episodes)
     warm_up = getattr(model, "learning_starts", 0)
@@ -189,6 +215,13 @@ def finish(job: Job, history: list[dict[str, float]], minutes: float) -> None:
     }
     write_at_once(directory / RESULTS, json.dumps(results, indent=1))
     shutil.rmtree(directory / CHECKPOINTS)
+
+
+def _save(model: Any, path: Path) -> None:
+    """Save the model in one move, since other programs take a run that has the file for finished."""
+    whole = path.with_suffix(".tmp")
+    model.save(whole)
+    whole.replace(path)
 
 
 def _title(options: Namespace, model: Any) -> str:

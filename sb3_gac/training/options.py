@@ -7,12 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
+from sb3_gac.base.loading import model_file
 from sb3_gac.checks.arguments import constructor_parameters
-from sb3_gac.envs.suites import SUITES, Suite, env_id_of, suite_of, task_of
-from sb3_gac.presets import PRESETS, merge, preset
+from sb3_gac.envs.suites import SUITES, Suite, env_id_of, registered_id, suite_of, task_of
+from sb3_gac.presets import PRESETS, instantiate, merge, preset, read_preset
 
 #: Number of noisy observations that the learner sees: on HalfCheetah, 50,000 steps, it returned 3766 with four, 3432 with one
 HISTORY = 4
@@ -35,6 +37,8 @@ DEFAULTS: Mapping[str, Any] = {
 EPISODES_ON_THE_WAY = 5
 #: Name of the argument by which algorithms take a teacher
 TEACHER = "teacher"
+#: Argument of an algorithm -> option of the main job that sets it
+_OWN_OPTIONS = {"env": "--env", "seed": "--seed", "tensorboard_log": "--tensorboard", TEACHER: "--teacher"}
 _COMPILE = {"auto": "auto", "yes": True, "no": False}
 #: Argument of this package's environments -> option of the main job
 _OF_TASKS = {"noise_std": "noise", "privileged": "privileged", "history": "history"}
@@ -197,14 +201,16 @@ def resolve(given: Mapping[str, Any]) -> Namespace:
     if "task" in given and "env" in given:
         raise ValueError("--task and --env: give one of them.")
     options = Namespace(**{**dict.fromkeys(("env", "noise", "history", "envs", "preset", "teacher")), **DEFAULTS, **given})
-    options.env_id = env_id_of(options.task) if options.env is None else options.env
-    suite = SUITES[suite_of(options.env_id) or ""] if suite_of(options.env_id) else None
+    options.env_id = env_id_of(options.task) if options.env is None else registered_id(options.env)
+    suite = suite_of(options.env_id)
     if suite is None:
         _resolve_own(options, given)
     else:
-        _resolve_task(options, given, suite)
-    options.envs = options.envs or PRESETS[options.preset].envs
+        _resolve_task(options, given, SUITES[suite])
+    options.envs = options.envs or read_preset(options.preset).envs
     _check_teacher(options)
+    _check_overrides(options.overrides)
+    _check_runs(options.runs)
     return options
 
 
@@ -220,9 +226,10 @@ def _resolve_task(options: Namespace, given: Mapping[str, Any], suite: Suite) ->
         _refuse(options, given, ("noise", "privileged"), f"{options.env_id} has no such argument")
     elif options.noise is None:
         options.noise = suite.noise_std
+    _check_noise(options.noise)
     options.preset = options.preset or suite.preset
     if options.history is None:
-        options.history = HISTORY if suite.history and options.noise and options.noise > 0 else 1
+        options.history = HISTORY if suite.history and np.max(options.noise or 0.0) > 0 else 1
     if options.history != 1 and not suite.history:
         raise ValueError(f"--history: {options.task} takes none.")
     options.wrappers = []
@@ -232,6 +239,20 @@ def _resolve_task(options: Namespace, given: Mapping[str, Any], suite: Suite) ->
         **({"history": options.history} if options.history != 1 else {}),
         **options.env_kwargs,
     }
+
+
+def _check_noise(noise: Any) -> None:
+    components = noise if isinstance(noise, list) and noise else [noise]
+    if noise is not None and not all(isinstance(part, int | float) and not isinstance(part, bool) for part in components):
+        raise ValueError(f"--env-kwargs: noise_std must be a number, or a list of one for each component, got {noise!r}.")
+
+
+def noise_in_words(noise: float | Sequence[float]) -> str:
+    """
+    :param noise: standard deviation of the sensor noise: a number, or one for each component
+    :return: the noise as a short text
+    """
+    return " by component" if isinstance(noise, Sequence) else f"{noise:g}"
 
 
 def _resolve_own(options: Namespace, given: Mapping[str, Any]) -> None:
@@ -261,14 +282,32 @@ def _check_teacher(options: Namespace) -> None:
         )
     if options.teacher is not None and not has_one:
         raise ValueError(f"--teacher: {kind.__name__} has none.")
-    if options.teacher is not None and not options.teacher.exists():
-        raise ValueError(f"--teacher: there is no file {options.teacher}.")
+    if options.teacher is not None:
+        try:
+            options.teacher = model_file(options.teacher)
+        except FileNotFoundError as error:
+            raise ValueError(f"--teacher: {error}") from None
+
+
+def _check_overrides(overrides: Mapping[str, Any]) -> None:
+    for name in overrides:
+        if not isinstance(name, str):
+            raise ValueError(f"--overrides: must have names of arguments as keys, got {name!r}.")
+        if name in _OWN_OPTIONS:
+            raise ValueError(f"--overrides: {name} is no argument of the preset: leave it out, and give {_OWN_OPTIONS[name]}.")
+
+
+def _check_runs(runs: Path) -> None:
+    there = next(path for path in (runs, *runs.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise ValueError(f"--runs: {there} is a file: give a directory.")
 
 
 def algorithm_arguments(options: Namespace) -> dict[str, Any]:
     """
     :param options: options of the run, see :func:`resolve`
-    :return: keyword arguments of the algorithm: the preset's for the task and its noise, below those of the command line
+    :return: keyword arguments of the algorithm: the preset's for the task and its noise, below those of the command line; a
+        noise for each component counts as its mean
     """
     kind: Any = algorithm_class(options.algorithm)
     own: dict[str, Any] = {"compile": options.compile}
@@ -279,8 +318,9 @@ def algorithm_arguments(options: Namespace) -> dict[str, Any]:
     # Without the whole state in one entry, critics need all entries
     without_state = options.privileged != "state" or (options.task is None and not options.whole_state)
     own |= {"role_keys": None} if without_state else {}
-    setting = {"task": options.task, "noise": options.noise or 0.0}
-    return preset(options.preset, algorithm=kind, **setting, **merge(own, options.overrides))
+    noise = float(np.mean(options.noise or 0.0))
+    of_preset = preset(options.preset, algorithm=kind, task=options.task, noise=noise)
+    return instantiate(merge(of_preset, merge(own, options.overrides)))
 
 
 def name_of_run(options: Namespace) -> str:
@@ -292,7 +332,7 @@ def name_of_run(options: Namespace) -> str:
     parts = [
         "" if options.algorithm == DEFAULTS["algorithm"] else options.algorithm,
         environment,
-        "" if options.noise is None else f"noise{options.noise:g}",
+        "" if options.noise is None else f"noise{noise_in_words(options.noise)}".replace(" ", "-"),
         "" if options.history == 1 else f"history{options.history}",
         f"seed{options.seed}",
     ]

@@ -125,6 +125,8 @@ def test_critics_see_every_entry_unless_privileged_is_the_whole_state():
 def test_a_registered_task_has_its_own_settings():
     (cell,) = _suite("--env", "sb3_gac/Hopper-v5", "--env-kwargs", "{noise_std: 0.3, history: 4}")["cells"]
     assert (cell["task"], cell["noises"], cell["history"]) == ("Hopper", [0.3], 4)
+    behind_a_module = _suite("--env", "sb3_gac:sb3_gac/Hopper-v5", "--env-kwargs", "{noise_std: 0.3, history: 4}")
+    assert behind_a_module == _suite("--env", "sb3_gac/Hopper-v5", "--env-kwargs", "{noise_std: 0.3, history: 4}")
     suite = _suite("--env", "sb3_gac/HopperPixels-v5")
     assert (suite["preset"], suite["cells"][0]["noises"]) == ("pixels", [0.0])
     (cell,) = _suite("--env", "sb3_gac/Hopper-v5", "--env-kwargs", "{privileged: velocity}")["cells"]

@@ -26,7 +26,7 @@ import benchmarks.config
 import benchmarks.run
 import sb3_gac.presets
 from benchmarks.aggregate import finished_runs, origins
-from benchmarks.checkpoint import SB3Checkpoints, checkpoints_of, locked
+from benchmarks.checkpoint import SB3Checkpoints, checkpoints_of
 from benchmarks.config import check_runs, read_algorithm, resolve
 from benchmarks.environments import environment
 from benchmarks.external import Program
@@ -35,6 +35,7 @@ from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
 from benchmarks.suite import RunSpec, made_with, read_suite
 from sb3_gac import GAC, PRESETS, preset
+from sb3_gac.checkpoint.lock import locked
 from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.presets import instantiate, read_preset
 from tests.helpers import Sampled, small_model

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_gac.envs.suites import SUITES, register, suite_of, task_of
+from sb3_gac.envs.suites import SUITES, is_batched, register, registered_id, suite_of, task_of
 from sb3_gac.envs.suites.extras import import_extra
 
 
@@ -27,6 +27,17 @@ def test_every_registered_environment_is_in_a_suite():
     ours = {env_id for env_id in gym.registry if env_id.startswith("sb3_gac/")}
     assert ours == {env_id for suite in SUITES.values() for env_id in suite.environments}
     assert suite_of("CartPole-v1") is None
+
+
+@pytest.mark.parametrize("env_id", ["sb3_gac/Hopper-v5", "sb3_gac/Go1Getup-v0", "sb3_gac/TigerDoor-v0", "CartPole-v1"])
+def test_an_environment_is_the_same_after_a_module_that_registers_it(env_id):
+    behind = f"sb3_gac:{env_id}"
+    for ask in (suite_of, task_of, is_batched):
+        assert ask(behind) == ask(env_id)
+    suite = suite_of(env_id)
+    assert registered_id(behind) == (behind if suite is None else env_id)
+    if suite is not None:
+        assert SUITES[suite].shows_whole_state(behind) == SUITES[suite].shows_whole_state(env_id)
 
 
 @pytest.mark.parametrize("name", [name for name, suite in SUITES.items() if suite.sensor_noise])

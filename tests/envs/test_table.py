@@ -39,6 +39,20 @@ def test_a_suite_is_installed_if_its_simulator_is_found(monkeypatch):
     assert suites.SUITES["mujoco"].is_installed
 
 
+def test_ids_are_found_in_small_letters_and_what_is_none_is_said(capsys):
+    main(["pendulum-V1"])
+    assert [line[0] for line in _cells(capsys.readouterr().out)[2:]] == ["sb3_gac/Pendulum-v1"]
+    with pytest.raises(SystemExit, match="None of the registered environments' ids contains 'nosuch'"):
+        main(["nosuch"])
+
+
+@pytest.mark.parametrize("options", [["--envs", "4", "0"], ["--seconds", "0"], ["--seconds", "nan"]])
+def test_a_measurement_of_nothing_is_refused(options, capsys):
+    with pytest.raises(SystemExit):
+        main(["sb3_gac/Pendulum-v1", "--speed", *options])
+    assert f"{options[0]}: must be" in capsys.readouterr().err
+
+
 def test_speed_is_measured_of_what_is_installed(capsys):
     main(["sb3_gac/Pendulum", "--speed", "--envs", "2", "3", "--seconds", "0.02"])
     header, _, line = _cells(capsys.readouterr().out)

@@ -1,6 +1,7 @@
 """The command, from models and exported files to table, curve and JSON."""
 
 import json
+import pickle
 import re
 import shlex
 from pathlib import Path
@@ -145,8 +146,19 @@ def test_the_statistics_of_vec_normalize_count(tmp_path):
     options = ("--env", ENV, "--noise", "0")
     with pytest.raises(SystemExit, match="pass --vec-normalize"):
         _evaluate(tmp_path / "normalised.zip", tmp_path, *options)
-    with pytest.raises(SystemExit, match="there is no file"):
-        _evaluate(tmp_path / "normalised.zip", tmp_path, *options, "--vec-normalize", str(tmp_path / "none"))
+    (tmp_path / "garbage.pkl").write_text("garbage")
+    (tmp_path / "other.pkl").write_bytes(pickle.dumps({"mean": 0}))
+    foreign = VecNormalize(DummyVecEnv([lambda: noisy_walk(history=2)]))
+    foreign.save(str(tmp_path / "foreign.pkl"))
+    for name, message in {
+        "none": "there is no file",
+        ".": "there is no file",
+        "garbage.pkl": "is no file that VecNormalize.save wrote",
+        "other.pkl": "holds dict, not what VecNormalize.save writes",
+        "foreign.pkl": r"is of another environment: its \"partial\" has the shape \(5,\), and the model's \(2,\)",
+    }.items():
+        with pytest.raises(SystemExit, match=message):
+            _evaluate(tmp_path / "normalised.zip", tmp_path, *options, "--vec-normalize", str(tmp_path / name))
     statistics = str(tmp_path / "statistics.pkl")
     found = _evaluate(tmp_path / "normalised", tmp_path, *options, "--vec-normalize", statistics, "--guider")
     (tmp_path / "statistics.pkl").rename(tmp_path / "vecnormalize.pkl")
@@ -181,17 +193,32 @@ def test_what_is_wrong_is_said_before_anything_is_run(gac, tmp_path, monkeypatch
         (gac, *NOISY, "--delay", "-1", "1"): "delay: steps must be",
         (gac, *NOISY, "--drop", "1.5"): "drop: probability must be",
         (gac, "--env", "sb3_gac/HalfCheetha-v5"): "HalfCheetha",
+        (gac, *NOISY[:2], "--env-kwargs", "{histroy: 2}"): "--env-kwargs: .*noisy_walk can't be made .*'histroy'",
+        (gac, "--env", "sb3_gac/Hopper-v5", "--env-kwargs", "{histroy: 2}"): "--env-kwargs: .*'histroy'",
+        (gac, *NOISY, "--out", tmp_path / "other.pt"): "--out: the folder .* can't be made",
+        (gac, *NOISY, "--out", tmp_path / "other.pt" / "below"): "--out: the folder .* can't be made",
+        (gac, *NOISY, "--vec-normalize", tmp_path / "other.pt"): "the model was trained without VecNormalize",
     }
     for arguments, message in wrong.items():
         with pytest.raises(SystemExit, match=message):
             main([*map(str, arguments)])
 
 
-def test_what_is_stopped_is_told_so(gac, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("content", ["", "[1]", "run: 3", "lr: 0.1", "task: {", "environment: {name: Hopper}"])
+def test_a_configuration_of_something_else_says_no_environment(content, gac, tmp_path):
+    model = tmp_path / "model.zip"
+    model.write_bytes(gac.read_bytes())
+    (tmp_path / "config.yaml").write_text(content)
+    with pytest.raises(SystemExit, match=r"--env is needed: there is no config.yaml beside .* that says where it was trained"):
+        main([str(model)])
+
+
+@pytest.mark.parametrize("where", ["run_episodes", "load_model"])
+def test_what_is_stopped_is_told_so(where, gac, tmp_path, monkeypatch, capsys):
     def stopped(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sb3_gac.evaluate.run_episodes", stopped)
+    monkeypatch.setattr(f"sb3_gac.evaluate.{where}", stopped)
     with pytest.raises(SystemExit) as end:
         _evaluate(gac, tmp_path, *NOISY)
     assert end.value.code == 130
@@ -218,7 +245,10 @@ def test_choices_are_actions_too():
         assert episode.length >= 1
 
 
-@pytest.mark.parametrize("options", [["--episodes", "0"], ["--env-kwargs", "4"], ["--delay", "0.5"], ["--noise"]])
+@pytest.mark.parametrize(
+    "options",
+    [["--episodes", "0"], ["--env-kwargs", "4"], ["--env-kwargs", "{a: ["], ["--delay", "0.5"], ["--noise"], ["--seed", "-1"]],
+)
 def test_the_option_that_is_wrong_is_named(options, capsys):
     with pytest.raises(SystemExit):
         main(["model.zip", *options])

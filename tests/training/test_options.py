@@ -5,13 +5,14 @@ import sys
 
 import gymnasium as gym
 import pytest
+import torch as th
 import yaml
 from gymnasium import spaces
 
 from sb3_gac.algorithms import ALGORITHMS
 from sb3_gac.envs import PARTIAL
 from sb3_gac.train import parse_arguments
-from sb3_gac.training.directory import new_directory
+from sb3_gac.training.directory import in_words, new_directory
 from sb3_gac.training.environments import find_modules_here
 from sb3_gac.training.job import open_environments, prepare
 from sb3_gac.training.options import DEFAULTS, algorithm_arguments, make_parser
@@ -51,7 +52,19 @@ def test_help_has_the_defaults_and_needs_no_more_than_80_columns(monkeypatch):
         (["--noise", "0.1", "--env-kwargs", "{noise_std: 0.2}"], "--env-kwargs and --noise say different things"),
         (["--task", "Go1Getup", "--history", "2"], "--history: Go1Getup takes none"),
         (["--algorithm", "cosil"], "give --teacher runs/<its directory>/model.zip"),
-        (["--algorithm", "tgrl", "--teacher", "nowhere.zip"], "--teacher: there is no file nowhere.zip"),
+        (["--algorithm", "tgrl", "--teacher", "nowhere.zip"], "--teacher: There is no file or directory nowhere.zip"),
+        (["--algorithm", "tgrl", "--teacher", "tests"], "--teacher: tests has no model.zip: the run has not finished"),
+        (["--runs", "pyproject.toml"], "--runs: pyproject.toml is a file: give a directory"),
+        (["--runs", "pyproject.toml/runs"], "pyproject.toml is a file: give a directory"),
+        (["--env-kwargs", "{noise_std: '0.2'}"], "noise_std must be a number, or a list of one for each component, got '0.2'"),
+        (["--env-kwargs", "{noise_std: [0.1, x]}"], "noise_std must be a number, or a list of one for each component"),
+        (["--overrides", "{1: 2}"], "--overrides: must have names of arguments as keys, got 1"),
+        (["--overrides", "{seed: 3}"], "--overrides: seed is no argument of the preset: leave it out, and give --seed"),
+        (
+            ["--overrides", "{teacher: x}"],
+            "teacher is no argument of the preset: leave it out, and give --teacher",
+        ),
+        (["--env", "sb3_gac:sb3_gac/TigerDoor-v0", "--noise", "0.1"], "--noise: sb3_gac/TigerDoor-v0 has no such argument"),
         (["--teacher", "model.zip"], "--teacher: GAC has none"),
         (["--steps", "0"], "--steps: must be an integer of at least 1, got 0"),
         (["--steps", "1e4"], "--steps: must be an integer of at least 1, got 1e4"),
@@ -81,9 +94,10 @@ def test_every_algorithm_without_a_teacher_can_be_made(algorithm, tmp_path):
 
 def test_a_teacher_is_the_file_of_another_run(tmp_path):
     prepare(parse_arguments(["--env", OWN, "--runs", str(tmp_path)])).model.save(tmp_path / "teacher.zip")
-    arguments = ["--env", OWN, "--algorithm", "cosil", "--teacher", str(tmp_path / "teacher.zip"), "--runs", str(tmp_path)]
-    job = prepare(parse_arguments(arguments))
+    arguments = ["--env", OWN, "--algorithm", "cosil", "--runs", str(tmp_path), "--teacher"]
+    job = prepare(parse_arguments([*arguments, str(tmp_path / "teacher.zip")]))
     assert job.model.teacher == str(tmp_path / "teacher.zip")
+    assert parse_arguments([*arguments, str(tmp_path / "teacher")]).teacher == tmp_path / "teacher.zip"
     assert str(parse_arguments(["--resume", str(job.directory)]).teacher) == job.model.teacher
 
 
@@ -102,6 +116,35 @@ def test_an_environment_of_ones_own_has_its_arguments_and_a_history_on_request(t
     configuration = yaml.safe_load((job.directory / "config.yaml").read_text())
     assert configuration["environment"]["kwargs"] == {"mass": 2.5}
     assert configuration["arguments"]["gamma"] == 0.5
+
+
+def test_a_task_is_the_same_after_the_name_of_a_module(tmp_path):
+    arguments = ["--env-kwargs", "{reset_noise_scale: 0.1}", "--env"]
+    alone, behind = (parse_arguments([*arguments, f"{module}sb3_gac/Hopper-v5"]) for module in ("", "sb3_gac:"))
+    assert (behind.task, behind.noise, behind.history, behind.env_id) == ("Hopper", 0.1, 4, "sb3_gac/Hopper-v5")
+    assert algorithm_arguments(behind) == algorithm_arguments(alone)
+
+
+def test_each_component_may_have_a_noise_of_its_own(tmp_path):
+    arguments = ["--task", "Pendulum", "--envs", "1", "--runs", str(tmp_path), "--env-kwargs"]
+    job = prepare(parse_arguments([*arguments, "{noise_std: [0.0, 0.2]}"]))
+    assert job.directory.name.startswith("Pendulum-noise-by-component-history4-")
+    again = parse_arguments(["--resume", str(job.directory)])
+    for options in (job.options, again):
+        assert options.env_kwargs == {"noise_std": [0.0, 0.2], "history": 4}
+    assert in_words(again) == "sb3_gac/Pendulum-v1 (noise by component, history 4)"
+    assert parse_arguments([*arguments, "{noise_std: [0.0, 0.0]}"]).history == 1
+    by_component = parse_arguments(["--task", "Ant", "--env-kwargs", f"{{noise_std: {[0.2, 0.4] * 6 + [0.3]}}}"])
+    assert algorithm_arguments(by_component) == algorithm_arguments(
+        parse_arguments(["--task", "Ant", "--noise", "0.3"])
+    ), "the mean"
+
+
+def test_names_of_torchs_classes_are_classes_in_overrides_too():
+    given = parse_arguments(["--overrides", "{policy_kwargs: {activation_fn: ReLU, optimizer_class: SGD}}"])
+    of_policy = algorithm_arguments(given)["policy_kwargs"]
+    assert (of_policy["activation_fn"], of_policy["optimizer_class"]) == (th.nn.ReLU, th.optim.SGD)
+    assert of_policy["net_arch"] == [128, 128], "the preset's"
 
 
 def test_critics_see_the_whole_state_alone_where_privileged_is_said_to_be_it():

@@ -22,6 +22,8 @@ ROOT = Path(__file__).parents[2]
         (["python", "-m", "sb3_gac.train", "--steps", "3"], ["python", "-m", "sb3_gac.train"]),
         (["/bin/python", "-u", "-m", "sb3_gac.train"], ["/bin/python", "-u", "-m", "sb3_gac.train"]),
         (["/bin/python", "/venv/bin/sb3-gac", "train", "--steps", "3"], ["sb3-gac", "train"]),
+        (["/bin/python", "-u", "-m", "sb3_gac", "train", "--steps", "3"], ["/bin/python", "-u", "-m", "sb3_gac", "train"]),
+        (["python", "-m", "sb3_gac", "evaluate", "train"], None),
         (["python", "/venv/bin/sb3-gac", "evaluate", "train"], None),
         (["python", "-m", "pytest", "sb3_gac.train"], None),
         (["python", "-c", "import sb3_gac.train"], None),
@@ -33,13 +35,25 @@ def test_the_main_job_is_told_from_other_programs(words, start, monkeypatch):
     assert command("--resume", "a b") == f"{' '.join(start or ['python', '-m', 'sb3_gac.train'])} --resume 'a b'"
 
 
-@pytest.mark.parametrize(("program", "handled"), [(["python", "-m", "sb3_gac.train"], True), (["python", "mine.py"], False)])
+@pytest.mark.parametrize(
+    ("program", "handled"),
+    [
+        (["python", "-m", "sb3_gac.train"], True),
+        (["python", "-m", "sb3_gac.evaluate", "model.zip"], True),
+        (["python", "/venv/bin/sb3-gac", "evaluate"], True),
+        (["python", "mine.py"], False),
+        (["python", "-m", "mine", "-m", "sb3_gac.train.py"], False),
+    ],
+)
 def test_no_other_program_has_its_handler_changed(program, handled, monkeypatch):
     monkeypatch.setattr(sys, "orig_argv", program)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         stopping.take_over()
         assert (signal.getsignal(signal.SIGINT) is stopping.end_at_once) == handled
+        with stopping.StoppedInALine():
+            is_main_job = started_as(program) is not None
+            assert (signal.getsignal(signal.SIGINT) is stopping.end_at_once) == is_main_job, "after the imports"
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         stopping.take_over()
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN, "in the background it is ignored, and stays so"
@@ -47,24 +61,25 @@ def test_no_other_program_has_its_handler_changed(program, handled, monkeypatch)
         signal.signal(signal.SIGINT, before)
 
 
-def _interrupted(tmp_path, program, *options):
+def _interrupted(tmp_path, program, *options, module="sb3_gac.train"):
     """
     :param program: code that is run before the main job's package is imported, with ``interrupt()``
     """
-    prelude = f"import os, signal, sys\nsys.orig_argv = ['python', '-m', 'sb3_gac.train']\nsys.path.insert(0, {str(ROOT)!r})\n"
+    prelude = f"import os, signal, sys\nsys.orig_argv = ['python', '-m', {module!r}]\nsys.path.insert(0, {str(ROOT)!r})\n"
     prelude += "def interrupt(*args, **kwargs):\n    os.kill(os.getpid(), signal.SIGINT)\n"
-    start = f"\nfrom sb3_gac.train import main\nmain({list(options)!r})"
+    start = f"\nfrom {module} import main\nmain({list(options)!r})"
     return subprocess.run(
         [sys.executable, "-c", prelude + program + start], cwd=tmp_path, capture_output=True, text=True, check=False
     )
 
 
-def test_while_other_libraries_are_imported(tmp_path):
+@pytest.mark.parametrize("module", ["sb3_gac.train", "sb3_gac.evaluate"])
+def test_while_other_libraries_are_imported(module, tmp_path):
     finder = "class Finder:\n    def find_spec(name, *args):\n        if name == 'gymnasium':\n            interrupt()\n"
     finder += "sys.meta_path.insert(0, Finder)\n"
-    ended = _interrupted(tmp_path, finder)
+    ended = _interrupted(tmp_path, finder, module=module)
     assert ended.returncode == 130
-    assert ended.stderr == "\nStopped before anything was written. To start again: python -m sb3_gac.train\n"
+    assert ended.stderr == f"\nStopped before anything was written. To start again: python -m {module}\n"
     assert list(tmp_path.iterdir()) == []
 
 

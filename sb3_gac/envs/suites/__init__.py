@@ -75,7 +75,7 @@ class Suite(NamedTuple):
         :param env_id: id of one of the suite's environments
         :return: whether the environment's privileged entry has all that ``partial`` shows
         """
-        return bool(self.environments[env_id].get("whole_state", self.sensor_noise))
+        return bool(self.environments[without_module(env_id)].get("whole_state", self.sensor_noise))
 
 
 _NAMESPACE = "sb3_gac/"
@@ -117,10 +117,29 @@ def suite_of(env_id: str) -> str | None:
     """
     Find the suite that has an environment.
 
-    :param env_id: id of an environment
+    :param env_id: id of an environment, alone or after a module that registers it, as in ``sb3_gac:sb3_gac/HalfCheetah-v5``
     :return: name of the suite that has the environment, ``None`` if no suite of this package has it
     """
-    return next((name for name, suite in SUITES.items() if env_id in suite.environments), None)
+    plain = without_module(env_id)
+    return next((name for name, suite in SUITES.items() if plain in suite.environments), None)
+
+
+def registered_id(env_id: str) -> str:
+    """
+    Find the id under which an environment is in this package's suites.
+
+    :param env_id: id of an environment, alone or after a module that registers it
+    :return: id without the module if a suite of this package has the environment, otherwise the id as it is
+    """
+    return env_id if suite_of(env_id) is None else without_module(env_id)
+
+
+def without_module(env_id: str) -> str:
+    """
+    :param env_id: id of an environment, alone or after a module that registers it and a colon
+    :return: id alone
+    """
+    return env_id.rpartition(":")[2]
 
 
 def env_id_of(task: str) -> str:
@@ -153,7 +172,7 @@ def task_named(name: str) -> str:
     :raises ValueError: if there is no such task; the message names the nearest ones
     """
     ids = registered_tasks()
-    plain = name.rpartition(":")[2].removeprefix(_NAMESPACE)
+    plain = without_module(name).removeprefix(_NAMESPACE)
     named = {**{env_id.removeprefix(_NAMESPACE): task for task, env_id in ids.items()}, **{task: task for task in ids}}
     if plain not in named:
         nearest = sorted(ids, key=lambda task: _likeness(task.casefold(), plain.casefold()), reverse=True)[:3]
@@ -175,7 +194,7 @@ def is_batched(env_id: str) -> bool:
     :return: whether its simulator steps many environments at once
     """
     suite = suite_of(env_id)
-    return suite is not None and "vec_entry_point" in SUITES[suite].environments[env_id]
+    return suite is not None and "vec_entry_point" in SUITES[suite].environments[without_module(env_id)]
 
 
 def batch_factory(env_id: str) -> tuple[Callable[..., Any], dict[str, Any]]:
@@ -188,17 +207,17 @@ def batch_factory(env_id: str) -> tuple[Callable[..., Any], dict[str, Any]]:
     """
     if not is_batched(env_id):
         raise ValueError(f"env_id must be of a suite whose simulator steps a batch, got {env_id!r}.")
-    arguments = SUITES[suite_of(env_id) or ""].environments[env_id]
+    arguments = SUITES[suite_of(env_id) or ""].environments[without_module(env_id)]
     module, _, function = arguments["vec_entry_point"].partition(":")
     return getattr(import_module(module), function), dict(arguments.get("kwargs", {}))
 
 
 def task_of(env_id: str) -> str:
     """
-    :param env_id: id of the form ``sb3_gac/<task>-v<version>``
+    :param env_id: id of the form ``sb3_gac/<task>-v<version>``, alone or after a module that registers it
     :return: name of the task, as presets and benchmarks have it
     """
-    return env_id.removeprefix(_NAMESPACE).rpartition("-v")[0]
+    return without_module(env_id).removeprefix(_NAMESPACE).rpartition("-v")[0]
 
 
 def shows_whole_state(task: str) -> bool:
