@@ -20,7 +20,7 @@ from benchmarks.config import check_programs, check_simulators
 from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, counted, findings, recommendation, worth
 from benchmarks.suite import NAME, RunSpec, default_name, read_definitions, read_suite
-from benchmarks.tidy import read_tidy
+from benchmarks.tidy import file_of, read_tidy
 from benchmarks.yaml_checks import check_is
 from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
@@ -207,10 +207,10 @@ def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
     """
     results = options.out / "results"
     aggregate.main([str(suite), "--runs", str(runs), "--out", str(results)])
-    tidy = read_tidy(results.with_suffix(".csv"))
+    tidy = read_tidy(file_of(results, "csv"))
     found = worth(tidy, random_returns(read_suite(suite)[0], options.out / "random.json"))
     path: Path = options.out / "index.html"
-    path.write_text(page(tidy, found, command(options), results.with_suffix(".json"), options.steps))
+    path.write_text(page(tidy, found, command(options), file_of(results, "json"), options.steps))
     print("\n" + "\n".join([*recommendation(found, options.steps), "", *findings(found)]))
     return path
 

@@ -19,7 +19,7 @@ from scipy import stats
 
 from benchmarks.intervals import CONFIDENCE, Difference, difference, mean_interval
 from benchmarks.page.summary import listed
-from benchmarks.tidy import read_tidy
+from benchmarks.tidy import file_of, number, read_tidy
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
@@ -178,16 +178,6 @@ def in_words(found: Worth, one: Difference) -> str:
     return f"{number(one.value)} ({number(one.low)} to {number(one.high)} with {CONFIDENCE:.0%} confidence{part})"
 
 
-def number(value: float) -> str:
-    """
-    :param value: return, or difference of returns
-    :return: text with three significant digits, or with all digits before the point if there are more
-    """
-    if value == 0 or abs(value) >= 100:
-        return f"{value:,.0f}"
-    return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
-
-
 def counted(number: int, noun: str) -> str:
     """
     :param number: number of things
@@ -289,7 +279,7 @@ def read_together(paths: Sequence[Path]) -> pd.DataFrame:
     """
     tables: list[pd.DataFrame] = []
     for path in paths:
-        tidy = read_tidy(path.with_suffix(".csv"))
+        tidy = read_tidy(file_of(path, "csv"))
         known = {name for table in tables for name in table.algorithm}
         tables.append(tidy.assign(algorithm=[f"{name} ({path.name})" if name in known else name for name in tidy.algorithm]))
     return pd.concat(tables)

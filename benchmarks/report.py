@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,11 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
 from benchmarks.page.cells import NOT_RUN, grid, is_wanted, palette, returns_range, title_of
+from benchmarks.page.digits import with_all_digits
 from benchmarks.page.document import page
 from benchmarks.page.plots import RETURN, curves, has_guider, steps_label
 from benchmarks.page.plots import interactive as interactive  # the plot of returns on the page, a figure of plotly
-from benchmarks.tidy import NEEDED, read_tidy, with_needed_steps
+from benchmarks.tidy import NEEDED, file_of, number, read_tidy, with_needed_steps
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -87,6 +89,7 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
     :return: Markdown table of the final returns
     """
     head = ("task", "noise", "algorithm", "learner, each seed", "mean", "IQM [95%]", "guider", "KL / target: min, mean, max")
+    plain = partial(number, thousands="")
     rows = []
     for cell in cells:
         iqm, low, high = cell["final_iqm"]
@@ -95,12 +98,12 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
             if "kl_over_target_min" in cell
             else ""
         )
-        guider = f"{cell['guider_mean']:.0f}" if "guider_mean" in cell else ""
-        seeds = ", ".join(f"{value:.0f}" for value in cell["final"])
+        guider = plain(cell["guider_mean"]) if "guider_mean" in cell else ""
+        seeds = ", ".join(map(plain, cell["final"]))
         noise = "" if cell["noise"] is None else f"{cell['noise']:g}"
         after = f", after {cell[NEEDED]:,} steps of needed runs" if NEEDED in cell else ""
-        first = (cell["task"], noise, cell["algorithm"] + after, seeds, f"{cell['final_mean']:.0f}")
-        rows.append((*first, f"{iqm:.0f} [{low:.0f}, {high:.0f}]", guider, kl))
+        first = (cell["task"], noise, cell["algorithm"] + after, seeds, plain(cell["final_mean"]))
+        rows.append((*first, f"{plain(iqm)} [{plain(low)}, {plain(high)}]", guider, kl))
     return markdown(head, rows)
 
 
@@ -140,12 +143,12 @@ def main() -> None:
     )
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS, help="of the figure (default: all)")
     options = parser.parse_args()
-    tidy = read_tidy(options.results.with_suffix(".csv"))
+    tidy = read_tidy(file_of(options.results, "csv"))
+    results = with_all_digits(json.loads(file_of(options.results, "json").read_text()), tidy)
     tidy = tidy.drop(columns=NEEDED, errors="ignore") if options.own_steps else with_needed_steps(tidy)
-    results = json.loads(options.results.with_suffix(".json").read_text())
-    draw(tidy, [options.results.with_suffix(f".{suffix}") for suffix in options.formats], results.get("still_to_run"))
+    draw(tidy, [file_of(options.results, suffix) for suffix in options.formats], results.get("still_to_run"))
     runs = os.path.relpath(options.runs, options.results.parent)
-    options.results.with_suffix(".html").write_text(page(tidy, results, options.results.stem, runs))
+    file_of(options.results, "html").write_text(page(tidy, results, options.results.name, runs))
     print(f"{cells_table(results['cells'])}\n\n{overall_table(results)}")
 
 
