@@ -1,5 +1,6 @@
 """Suites: a YAML file names algorithms, tasks, noise levels and seeds; it is read into training runs, every key checked."""
 
+import math
 import re
 import sys
 from collections import Counter
@@ -10,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from benchmarks.yaml_checks import check_is, check_keys, check_list, check_numbers
+from benchmarks.yaml_checks import check_is, check_keys, check_list, check_numbers, read_yaml
 from sb3_gac.presets import read_preset
 
 HERE = Path(__file__).parent
@@ -154,10 +155,7 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
     :return: settings of its runs: one list for each noise of each entry of ``cells``
     :raises ValueError: if a key is unknown or missing, or a run is listed twice
     """
-    try:
-        suite = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path.name} is not YAML: {error}") from None
+    suite = read_yaml(path)
     check_is(path.name, suite, "a mapping", Mapping)
     if "preset" in suite:
         suite = {**read_preset(suite["preset"]).run, **suite}
@@ -195,7 +193,7 @@ def _check_distinct(name: str, specs: list[RunSpec]) -> None:
 
 def read_definitions() -> dict[str, Any]:
     """The content of ``hyperparams/algorithms.yml``: algorithm's name -> its class, arguments, and the runs that it needs."""
-    definitions: dict[str, Any] = yaml.safe_load((HYPERPARAMS / "algorithms.yml").read_text())
+    definitions: dict[str, Any] = read_yaml(HYPERPARAMS / "algorithms.yml")
     return definitions
 
 
@@ -259,14 +257,17 @@ class _Reader:
         check_keys(where, cell, _TASK_KEYS, _TASK_KEYS - {"needs", "history"})
         if "history" in cell:
             check_is(f"{where}, history", cell["history"], "a whole number above 1", int, lambda number: number > 1)
+        check_is(f"{where}, task", cell["task"], "the name of a task, as in Hopper", str, len)
         check_list(f"{where}, noises", cell["noises"], "numbers", (int, float))
+        for noise in cell["noises"]:
+            check_is(f"{where}, noises", noise, "numbers that are finite, each", (int, float), math.isfinite)
         return None, cell["task"], [float(noise) for noise in cell["noises"]]
 
     def _particulars(self, where: str, cell: Any) -> dict[str, dict[str, Any]]:
         """For each algorithm, the definition that the suite has of it, and the runs that it needs."""
         changes = cell.get("needs", {})
         check_is(f"{where}, needs", changes, "a mapping", Mapping)
-        if unknown := sorted(set(changes) - set(cell["algorithms"])):
+        if unknown := sorted(map(str, set(changes) - set(cell["algorithms"]))):
             raise ValueError(f"{where}, needs: the cell has no algorithms {unknown}; it has {cell['algorithms']}.")
         return {
             name: {
