@@ -1,5 +1,6 @@
 """Reads YAML whose keys differ, and checks its values, with errors that name the key in the file."""
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -39,11 +40,11 @@ def check_list(where: str, values: Any, what: str, kinds: type | tuple[type, ...
     :param values: value that was read from YAML
     :param what: description of the elements, for an error message, such as "whole numbers"
     :param kinds: types that an element may have
-    :raises ValueError: if the value is no list, if the list is empty, or if an element has another type or is a number below 0
+    :raises ValueError: if the value is no list or an empty one, or if an element has another type, is infinite or below 0
     """
     check_is(where, values, f"a list of at least one of {what}", list, len)
     for value in values:
-        check_is(where, value, f"{what}, each", kinds, lambda value: isinstance(value, str) or value >= 0)
+        check_is(where, value, f"{what}, each", kinds, lambda value: isinstance(value, str) or 0 <= value < math.inf)
 
 
 def check_numbers(where: str, value: Any, is_meant: Callable[[Any], Any] | None = None) -> None:
