@@ -12,6 +12,7 @@ directories are elsewhere, or gone, from the results into which they were aggreg
 import argparse
 import json
 import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,25 @@ def collect(runs: list[FinishedRun]) -> pd.DataFrame:
     frames = [run.evaluations.assign(**names_of(run.spec), **of_needed[run.name]) for run in runs]
     tidy = pd.concat(frames, ignore_index=True)
     return tidy[[*NAMES, *(column for column in tidy.columns if column not in NAMES)]]
+
+
+def check_finite(runs: Sequence[FinishedRun]) -> None:
+    """
+    :param runs: records of finished runs
+    :raises ValueError: naming a run and an evaluation whose return, or whose KL over its target, is no number to average
+    """
+    for run in runs:
+        rows = run.evaluations
+        numbers = {name: rows[name] for name in ("learner", "guider") if name in rows}
+        if {"kl", "target_kl"} <= set(rows):
+            numbers["kl / target_kl"] = rows.kl / rows.target_kl
+        for name, values in numbers.items():
+            wrong = np.isinf(values) if name != "learner" else ~np.isfinite(values)  # others may be missing at first
+            if wrong.any():
+                where = f"{run.name}, after {rows.timesteps[wrong].iloc[0]:,} steps"
+                raise ValueError(
+                    f"{where}: {name} is {values[wrong].iloc[0]}: make the run again, or leave it out of the suite."
+                )
 
 
 def choose_reference(algorithms: list[str], wanted: str | None = None) -> str:
@@ -280,13 +300,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
     add_reuse_options(parser)
     options = parser.parse_args(arguments)
-    runs, missing = finished_runs(options.suite, options.runs, options.complete_cells, options.reuse_results, options.rerun)
+    try:
+        runs, missing = finished_runs(
+            options.suite, options.runs, options.complete_cells, options.reuse_results, options.rerun
+        )
+        check_finite(runs)
+        reference = choose_reference(list(dict.fromkeys(run.spec.algorithm for run in runs)), options.reference)
+    except (ValueError, OSError) as error:
+        sys.exit(str(error))
     evaluations = file_of(options.out, "csv")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     table = collect(runs).replace({"noise": {NO_NOISE: np.nan}})
     table.to_csv(evaluations, index=False, float_format="%.6g")
     tidy = read_tidy(evaluations)  # so that the scores can be computed from the file to the last digit
-    reference = choose_reference(list(tidy.algorithm.unique()), options.reference)
     results = {
         "command": command(options),
         **origins(runs),

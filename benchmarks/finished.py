@@ -132,7 +132,11 @@ def read_reused(results: Sequence[Path], specs: Sequence[RunSpec], rerun: Sequen
     :param specs: settings of the runs to look for
     :param rerun: names of the algorithms whose runs do not count
     :return: run's name -> records of each run that was found, see :func:`read_results`
+    :raises ValueError: if none of the runs is of an algorithm in ``rerun``
     """
+    names = sorted({spec.algorithm for spec in specs})
+    if unknown := sorted(set(rerun) - set(names)):
+        raise ValueError(f"--rerun: the suite has no algorithms {unknown}; it has {names}.")
     wanted = [spec for spec in specs if spec.algorithm not in rerun]
     return {name: run for path in results for name, run in read_results(path, wanted).items()}
 

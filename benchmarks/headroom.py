@@ -9,6 +9,7 @@ prints the ends of all runs, how much they vary, and each algorithm's difference
 
 import argparse
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +20,7 @@ from scipy import stats
 
 from benchmarks.intervals import CONFIDENCE, Difference, difference, mean_interval
 from benchmarks.page.summary import listed
-from benchmarks.tidy import file_of, number, read_tidy
+from benchmarks.tidy import NO_NOISE, file_of, number, read_tidy
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
@@ -263,10 +264,20 @@ def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
     for (task, noise), cell in tidy.groupby(["task", "noise"], sort=False):
         ends = by_algorithm(cell, end_of)
         for name, of_seeds in ends.items():
-            spread = f"{of_seeds.std(ddof=1) / abs(of_seeds.mean()):.0%}" if len(of_seeds) > 1 else ""
+            spread = f"{of_seeds.std(ddof=1) / abs(of_seeds.mean()):.0%}" if len(of_seeds) > 1 and of_seeds.mean() else ""
             compared = difference(ends, name, reference)[2:] if reference in ends and name != reference else ()
             seeds, over = ", ".join(map(number, of_seeds)), ", ".join(map(number, compared))
-            rows.append([str(task), f"{noise:g}", name, seeds, number(float(of_seeds.mean())), spread, over])
+            rows.append(
+                [
+                    str(task),
+                    "" if noise == NO_NOISE else f"{noise:g}",
+                    name,
+                    seeds,
+                    number(float(of_seeds.mean())),
+                    spread,
+                    over,
+                ]
+            )
     return rows
 
 
@@ -293,10 +304,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, nargs="+", help="paths of aggregated results, without a suffix")
-    parser.add_argument("--reference", default=ASYMMETRIC, help=f"algorithm to compare with (default: {ASYMMETRIC})")
+    parser.add_argument("--reference", help=f"algorithm to compare with (default: {ASYMMETRIC})")
     options = parser.parse_args(arguments)
-    head = ["task", "noise", "algorithm", "each seed's end", "mean", "spread", f"over {options.reference}: value, low, high"]
-    print(in_columns(head, ends_table(read_together(options.results), options.reference)))
+    try:
+        tidy = read_together(options.results)
+    except (ValueError, OSError) as error:
+        sys.exit(str(error))
+    reference, names = options.reference or ASYMMETRIC, sorted(tidy.algorithm.unique())
+    if options.reference and reference not in names:
+        sys.exit(f"--reference: the results have no algorithm {reference!r}; they have {names}.")
+    head = ["task", "noise", "algorithm", "each seed's end", "mean", "spread", f"over {reference}: value, low, high"]
+    print(in_columns(head, ends_table(tidy, reference)))
 
 
 if __name__ == "__main__":

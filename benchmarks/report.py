@@ -10,6 +10,7 @@ The command reads ``halfcheetah.csv`` and ``halfcheetah.json``. Beside them, it 
 import argparse
 import json
 import os
+import sys
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -77,10 +78,12 @@ def _legend_below(figure: Figure, lines: Mapping[str, Artist]) -> None:
     """Put a legend below the axes, with as many names side by side as the figure has room for."""
     for columns in range(len(lines), 0, -1):
         legend = figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=columns, fontsize="small")
-        if legend.get_window_extent().width <= figure.bbox.width:
+        if legend.get_window_extent().width <= figure.bbox.width or columns == 1:
+            rows = -(-len(lines) // columns)
+            more = legend.get_window_extent().height / figure.dpi * (rows - 1) / rows  # so that the axes keep their height
+            figure.set_figheight(figure.get_figheight() + more)
             return
-        if columns > 1:
-            legend.remove()
+        legend.remove()
 
 
 def cells_table(cells: list[dict[str, Any]]) -> str:
@@ -143,8 +146,11 @@ def main() -> None:
     )
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS, help="of the figure (default: all)")
     options = parser.parse_args()
-    tidy = read_tidy(file_of(options.results, "csv"))
-    results = with_all_digits(json.loads(file_of(options.results, "json").read_text()), tidy)
+    try:
+        tidy = read_tidy(file_of(options.results, "csv"))
+        results = with_all_digits(json.loads(file_of(options.results, "json").read_text()), tidy)
+    except OSError as error:
+        sys.exit(str(error))
     tidy = tidy.drop(columns=NEEDED, errors="ignore") if options.own_steps else with_needed_steps(tidy)
     draw(tidy, [file_of(options.results, suffix) for suffix in options.formats], results.get("still_to_run"))
     runs = os.path.relpath(options.runs, options.results.parent)

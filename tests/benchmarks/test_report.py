@@ -19,6 +19,7 @@ from benchmarks.headroom import read_together
 from benchmarks.page.cells import palette
 from benchmarks.page.digits import with_all_digits
 from benchmarks.page.document import normalised_returns
+from benchmarks.page.plots import plots
 from benchmarks.page.tables import returns_table
 from benchmarks.report import cells_table, draw, interactive, main
 from benchmarks.tidy import normalised_scores, number, read_tidy, run_scores
@@ -84,6 +85,37 @@ def test_a_figure_of_one_cell_names_all_of_its_algorithms(tmp_path, monkeypatch)
     assert tried, "all names in a line would be wider"
     assert kept.get_window_extent().width <= kept.figure.bbox.width
     assert [text.get_text() for text in kept.get_texts()] == names
+
+
+def test_a_legend_of_many_rows_makes_the_figure_higher(tmp_path, monkeypatch):
+    heights, make = [], Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, *args, **kwargs: (make(figure, *args, **kwargs), heights.append(_heights(figure)))
+    )
+    for count in (1, 16):
+        tidy = _tidy([f"guided-actor-critic-with-a-very-long-name-{number}" for number in range(count)])
+        draw(tidy[tidy.task == "Ant"], [tmp_path / "figure.png"])
+    (figure, panel), (higher, same) = heights
+    assert figure == 3.0
+    assert higher > 1.5 * figure
+    assert same == pytest.approx(panel, abs=0.15)
+
+
+def _heights(figure):
+    """Inches of a figure, and of its panel."""
+    return figure.get_figheight(), figure.axes[0].get_window_extent().height / figure.dpi
+
+
+def test_a_target_that_is_no_number_gives_no_plot_of_the_kl():
+    tidy = _tidy(["gac"], guider=True).assign(target_kl=math.nan)
+    nothing = normalised_returns({"cells": [], "compared": {"cells": [], "algorithms": []}})
+    assert "KL" not in [one.name for one in plots(tidy, {}, nothing)]
+
+
+def test_results_that_are_gone_are_said_in_a_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["report", str(tmp_path / "gone")])
+    with pytest.raises(SystemExit, match=r"No such file .*gone\.csv"):
+        main()
 
 
 @pytest.mark.parametrize("name", COMMITTED)
