@@ -12,6 +12,7 @@ directories are elsewhere, or gone, from the results into which they were aggreg
 import argparse
 import json
 import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,6 @@ from rliable import metrics
 
 from benchmarks.bootstrap import Estimate, estimate, improvements, interval
 from benchmarks.finished import (
-    NAMES,
     FinishedRun,
     add_reuse_options,
     kind_of,
@@ -34,9 +34,8 @@ from benchmarks.finished import (
     settings_of,
 )
 from benchmarks.suite import HERE, RUNS, needed_steps, read_cells
-from benchmarks.tidy import NEEDED, NO_NOISE, read_tidy
+from benchmarks.tidy import CELL, NAMES, NEEDED, NO_NOISE, file_of, normalised_scores, read_tidy, run_scores, significant
 
-CELL = ["task", "noise"]
 REFERENCE = "sac-asym"
 STEADY_FROM = 5_000
 
@@ -81,14 +80,23 @@ def collect(runs: list[FinishedRun]) -> pd.DataFrame:
     return tidy[[*NAMES, *(column for column in tidy.columns if column not in NAMES)]]
 
 
-def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
+def check_finite(runs: Sequence[FinishedRun]) -> None:
     """
-    :param tidy: evaluations, see :func:`collect`
-    :return: table with one row for each run: "final", the mean return of the last evaluation, and "area", the mean return over
-        all evaluations, which is the area under the curve divided by its length
+    :param runs: records of finished runs
+    :raises ValueError: naming a run and an evaluation whose return, or whose KL over its target, is no number to average
     """
-    by_run = tidy.sort_values("timesteps", kind="stable").groupby(NAMES, sort=False)
-    return by_run.learner.agg(final="last", area="mean").reset_index()
+    for run in runs:
+        rows = run.evaluations
+        numbers = {name: rows[name] for name in ("learner", "guider") if name in rows}
+        if {"kl", "target_kl"} <= set(rows):
+            numbers["kl / target_kl"] = rows.kl / rows.target_kl
+        for name, values in numbers.items():
+            wrong = np.isinf(values) if name != "learner" else ~np.isfinite(values)  # others may be missing at first
+            if wrong.any():
+                where = f"{run.name}, after {rows.timesteps[wrong].iloc[0]:,} steps"
+                raise ValueError(
+                    f"{where}: {name} is {values[wrong].iloc[0]}: make the run again, or leave it out of the suite."
+                )
 
 
 def choose_reference(algorithms: list[str], wanted: str | None = None) -> str:
@@ -124,10 +132,10 @@ def summarise_cells(tidy: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
                     "algorithm": algorithm,
                     **({NEEDED: steps_before(group)} if steps_before(group) else {}),
                     "seeds": own.seed.tolist(),
-                    "final": own.final.round(1).tolist(),
-                    "final_mean": round(float(own.final.mean()), 1),
-                    "final_iqm": interval(own.final.to_numpy()),
-                    "area_iqm": interval(own.area.to_numpy()),
+                    "final": list(map(significant, own.final)),
+                    "final_mean": significant(own.final.mean()),
+                    "final_iqm": list(map(significant, interval(own.final.to_numpy()))),
+                    "area_iqm": list(map(significant, interval(own.area.to_numpy()))),
                     "steps_to_reference": steps_to(group, of_reference),
                     **guidance(group),
                 }
@@ -174,25 +182,7 @@ def guidance(group: pd.DataFrame) -> dict[str, float]:
     )  # before the first gradient step no algorithm has these columns
     ratio = (steady.kl / steady.target_kl).dropna()
     kl = {f"kl_over_target_{name}": round(float(getattr(ratio, name)()), 3) for name in ("min", "mean", "max") if len(ratio)}
-    return {"guider_mean": round(float(final.guider.mean()), 1), **kl}
-
-
-def normalised_scores(tidy: pd.DataFrame) -> pd.DataFrame:
-    """
-    Normalise the returns of each cell, from the lowest point of its curves to its best end. A constant that is added to all
-    returns, or a positive factor, changes nothing.
-
-    :param tidy: evaluations, see :func:`collect`
-    :return: table of :func:`run_scores` with three more columns: "low", the lowest mean over seeds of any algorithm at any
-        evaluation in the cell; "high", the best algorithm's mean final return in the cell; and "normalised", the final return
-        on a scale with "low" at 0 and "high" at 1
-    """
-    scores = run_scores(tidy)
-    low = tidy.groupby([*CELL, "algorithm", "timesteps"]).learner.mean().groupby(CELL).min()
-    high = scores.groupby([*CELL, "algorithm"]).final.mean().groupby(CELL).max()
-    scores = scores.merge(pd.DataFrame({"low": low, "high": high}).reset_index(), on=CELL)
-    span = (scores.high - scores.low).replace(0.0, 1.0)  # where no returns differ, all algorithms are the best
-    return scores.assign(normalised=1 - (scores.high - scores.final) / span)
+    return {"guider_mean": significant(final.guider.mean()), **kl}
 
 
 def compare(tidy: pd.DataFrame) -> dict[str, Any]:
@@ -232,8 +222,8 @@ def _compared_cells(compared: pd.DataFrame) -> list[dict[str, Any]]:
     return [
         {
             **_named(key),
-            "low": round(float(cell.low.iloc[0]), 3),
-            "high": round(float(cell.high.iloc[0]), 3),
+            "low": significant(cell.low.iloc[0]),
+            "high": significant(cell.high.iloc[0]),
             "seeds": {str(name): group.seed.tolist() for name, group in cell.groupby("algorithm", sort=False)},
         }
         for key, cell in compared.groupby(CELL)
@@ -310,13 +300,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")
     add_reuse_options(parser)
     options = parser.parse_args(arguments)
-    runs, missing = finished_runs(options.suite, options.runs, options.complete_cells, options.reuse_results, options.rerun)
-    evaluations = options.out.with_suffix(".csv")
+    try:
+        runs, missing = finished_runs(
+            options.suite, options.runs, options.complete_cells, options.reuse_results, options.rerun
+        )
+        check_finite(runs)
+        reference = choose_reference(list(dict.fromkeys(run.spec.algorithm for run in runs)), options.reference)
+    except (ValueError, OSError) as error:
+        sys.exit(str(error))
+    evaluations = file_of(options.out, "csv")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     table = collect(runs).replace({"noise": {NO_NOISE: np.nan}})
     table.to_csv(evaluations, index=False, float_format="%.6g")
     tidy = read_tidy(evaluations)  # so that the scores can be computed from the file to the last digit
-    reference = choose_reference(list(tidy.algorithm.unique()), options.reference)
     results = {
         "command": command(options),
         **origins(runs),
@@ -325,7 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "cells": summarise_cells(tidy, reference),
         **compare(tidy),
     }
-    options.out.with_suffix(".json").write_text(json.dumps(results, indent=1, allow_nan=False))
+    file_of(options.out, "json").write_text(json.dumps(results, indent=1, allow_nan=False))
 
 
 if __name__ == "__main__":

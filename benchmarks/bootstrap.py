@@ -52,7 +52,7 @@ def interval(scores: np.ndarray) -> list[float]:
     :return: interquartile mean of the scores, and the two ends of its interval
     """
     point, (low, high) = estimate({"one": scores[:, None]}, metrics.aggregate_iqm)["one"]
-    return [round(value, 1) for value in (point, low, high)]
+    return [point, low, high]
 
 
 def improvements(matrices: dict[str, np.ndarray]) -> dict[str, Estimate]:

@@ -17,10 +17,10 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from benchmarks import aggregate, launch
 from benchmarks.comparison_page import page
 from benchmarks.config import check_programs, check_simulators
-from benchmarks.environments import EVAL_SEED, make_envs
+from benchmarks.environments import EVAL_SEED, environment, make_envs
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, counted, findings, recommendation, worth
 from benchmarks.suite import NAME, RunSpec, default_name, read_definitions, read_suite
-from benchmarks.tidy import read_tidy
+from benchmarks.tidy import file_of, read_tidy
 from benchmarks.yaml_checks import check_is
 from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
@@ -106,7 +106,8 @@ def _registered(options: argparse.Namespace) -> dict[str, Any] | None:
     suite = suite_of(options.env)
     if suite is None or options.wrappers or set(options.env_kwargs) - _OF_TASKS:
         return None
-    history = {"history": options.env_kwargs["history"]} if "history" in options.env_kwargs else {}
+    given = options.env_kwargs.get("history", 1)
+    history = {} if given == 1 else {"history": given}  # a suite leaves out a history of the newest observation alone
     default = SUITES[suite].noise_std if SUITES[suite].sensor_noise else 0.0
     return {"task": task_of(options.env), "noises": [options.env_kwargs.get("noise_std", default)], **history}
 
@@ -153,8 +154,10 @@ def command(options: argparse.Namespace) -> str:
     return shlex.join(["python", "-m", "sb3_gac.compare", *words, *(["--whole-state"] * options.whole_state)])
 
 
-def _flow(values: Mapping[str, Any]) -> str:
-    return yaml.safe_dump(dict(values), default_flow_style=True, sort_keys=False, width=10_000).strip()
+def _flow(values: Any) -> str:
+    given = dict(values) if isinstance(values, Mapping) else values  # the suite's check says what is wrong with others
+    text = yaml.safe_dump(given, default_flow_style=True, sort_keys=False, width=10_000)
+    return text.strip().removesuffix("...").strip()
 
 
 def run(options: argparse.Namespace) -> Path:
@@ -207,10 +210,10 @@ def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
     """
     results = options.out / "results"
     aggregate.main([str(suite), "--runs", str(runs), "--out", str(results)])
-    tidy = read_tidy(results.with_suffix(".csv"))
+    tidy = read_tidy(file_of(results, "csv"))
     found = worth(tidy, random_returns(read_suite(suite)[0], options.out / "random.json"))
     path: Path = options.out / "index.html"
-    path.write_text(page(tidy, found, command(options), results.with_suffix(".json"), options.steps))
+    path.write_text(page(tidy, found, command(options), file_of(results, "json"), options.steps))
     print("\n" + "\n".join([*recommendation(found, options.steps), "", *findings(found)]))
     return path
 
@@ -218,16 +221,22 @@ def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
 def random_returns(spec: RunSpec, path: Path) -> np.ndarray:
     """
     :param spec: settings of a run
-    :param path: JSON file from which the returns are read; if there is none, the episodes are run and the file is written
+    :param path: JSON file from which the returns are read; if there is none, or one of another environment, the episodes are
+        run and the file is written
     :return: returns of episodes with random actions, on the environments of evaluations, shape (N,)
     """
-    if not path.exists():
+    wrappers = spec.environment["wrappers"] if spec.environment else []
+    what = {"environment": environment(spec), "wrappers": wrappers, "episodes": [RANDOM_EPISODES, spec.eval_episodes]}
+    recorded = json.loads(json.dumps(what, default=str))
+    known = json.loads(path.read_text()) if path.exists() else {}
+    if not isinstance(known, dict) or known.get("of") != recorded:  # a list is of an earlier version, and of who knows what
         env = make_envs(spec, spec.eval_episodes)
         env.seed(EVAL_SEED)
         returns, _ = evaluate_policy(UniformActions(env), env, RANDOM_EPISODES, return_episode_rewards=True)
         env.close()
-        path.write_text(json.dumps(returns))
-    return np.array(json.loads(path.read_text()))
+        known = {"of": recorded, "returns": returns}
+        path.write_text(json.dumps(known))
+    return np.array(known["returns"])
 
 
 def main(description: str | None = None) -> None:
@@ -239,7 +248,7 @@ def main(description: str | None = None) -> None:
     options = parse_arguments(description)
     try:
         print(f"\nPage: {run(options)}")
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(str(error))
 
 

@@ -14,7 +14,6 @@ from benchmarks.headroom import (
     findings,
     headroom_curve,
     in_words,
-    number,
     recommendation,
     title,
 )
@@ -23,6 +22,7 @@ from benchmarks.page.cells import palette, title_of
 from benchmarks.page.document import document, tabs
 from benchmarks.page.plots import RETURN, STEPS, Plot, algorithm_lines
 from benchmarks.page.tables import Field, table
+from benchmarks.tidy import number
 
 _FRAME = {
     "template": "plotly_white",

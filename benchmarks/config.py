@@ -25,6 +25,8 @@ from sb3_gac.presets import instantiate, merge, read_preset
 from sb3_gac.training.environments import normalized
 
 POLICY = "MultiInputPolicy"
+#: Arguments that a run sets itself, so that another value would be recorded and have no effect -> what to do instead
+_GIVEN_TO_RUNS = {"seed": "list seeds in the cell", "device": "all runs are made on the CPU"}
 _GIVEN_TO_POLICIES = {"observation_space", "action_space", "lr_schedule"}
 
 
@@ -92,21 +94,26 @@ def _check_values(where: str, specs: Iterable[RunSpec]) -> None:
     made: set[tuple[type, str]] = set()
     for spec in specs:
         kind, arguments = resolve(spec)
-        is_new = (kind, repr(arguments)) not in made
-        if not is_new or spec.environment is not None or not can_be_made(spec, kind) or is_batched(environment(spec)[0]):
+        what = (kind, repr([arguments, normalization(spec)]))
+        if what in made or spec.environment is not None or not can_be_made(spec, kind) or not _is_at_hand(spec):
             continue
-        made.add((kind, repr(arguments)))
+        made.add(what)
         try:
-            env = normalized(make_envs(spec, 1, spec.seed), normalization(spec))
-        except Exception:  # a simulator may be missing, which a dry run does not need
-            continue
-        try:
-            make_small(kind, arguments, env, spec.seed)
+            env = make_envs(spec, 1, spec.seed)
+            try:
+                make_small(kind, arguments, normalized(env, normalization(spec)), spec.seed)
+            finally:
+                env.close()
         except Exception as error:
             said = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
             raise ValueError(f"{where}: {spec.cell}, {spec.algorithm}: {said}") from error
-        finally:
-            env.close()
+
+
+def _is_at_hand(spec: RunSpec) -> bool:
+    """Whether a registered task can be made here: a dry run needs no simulator, and a batched one takes long to start."""
+    env_id, _ = environment(spec)
+    suite = suite_of(env_id)
+    return not is_batched(env_id) and (suite is None or SUITES[suite].is_installed)
 
 
 def can_be_made(spec: RunSpec, kind: type) -> bool:
@@ -207,11 +214,14 @@ def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:
     needed = needed_runs(spec)
     if both := sorted(set(needed) & set(resolved)):
         raise ValueError(f"{spec.algorithm}: {both} are what it needs, and among its arguments too.")
+    for name in sorted(_GIVEN_TO_RUNS.keys() & resolved.keys()):
+        raise ValueError(f"{spec.algorithm}: {name} is no argument of a suite: {_GIVEN_TO_RUNS[name]}.")
     _check_known(spec.algorithm, {**resolved, **needed}, kind, {"env"})
     policies, policy = kind.policy_aliases, resolved.get("policy", POLICY)  # type: ignore[attr-defined]
-    if policy not in policies:
-        raise ValueError(f"{spec.algorithm}: policy must be one of {sorted(policies)}, got {policy!r}.")
-    of_policy = _present(f"{spec.algorithm}, policy_kwargs", policies[policy], resolved.get("policy_kwargs") or {})
+    check_is(f"{spec.algorithm}: policy", policy, f"one of {sorted(policies)}", str, policies.get)
+    for_policy = resolved.get("policy_kwargs") or {}
+    check_is(f"{spec.algorithm}: policy_kwargs", for_policy, "a mapping, such as {net_arch: [64, 64]}", Mapping)
+    of_policy = _present(f"{spec.algorithm}, policy_kwargs", policies[policy], for_policy)
     resolved |= {"policy_kwargs": of_policy} if of_policy else {}
     _check_known(f"{spec.algorithm}, policy_kwargs", of_policy, policies[policy], _GIVEN_TO_POLICIES)
     check_numbers(spec.algorithm, resolved)
@@ -267,6 +277,6 @@ def settings_in_present_names(kind: type, settings: Mapping[str, Any]) -> dict[s
 
 def _check_known(where: str, arguments: Mapping[str, Any], taker: type, given: set[str]) -> None:
     known = sorted(set(constructor_parameters(taker)) - given)
-    unknown = sorted(set(arguments) - set(known))
+    unknown = sorted(map(str, set(arguments) - set(known)))
     if unknown:
         raise ValueError(f"{where}: {taker.__name__} has no arguments {unknown}; it has {known}.")

@@ -13,10 +13,8 @@ import yaml
 
 from benchmarks.config import in_present_names, read_algorithm, resolve, settings_in_present_names
 from benchmarks.suite import UNSAID, RunSpec, made_with
-from benchmarks.tidy import NEEDED, NO_NOISE, read_tidy
+from benchmarks.tidy import NAMES, NEEDED, NO_NOISE, file_of, read_tidy
 
-#: The columns that together identify a run of a suite
-NAMES = ["task", "noise", "algorithm", "seed"]
 _PARTICULARS = ["environment", "definition", "needs", "history"]
 
 
@@ -134,7 +132,11 @@ def read_reused(results: Sequence[Path], specs: Sequence[RunSpec], rerun: Sequen
     :param specs: settings of the runs to look for
     :param rerun: names of the algorithms whose runs do not count
     :return: run's name -> records of each run that was found, see :func:`read_results`
+    :raises ValueError: if none of the runs is of an algorithm in ``rerun``
     """
+    names = sorted({spec.algorithm for spec in specs})
+    if unknown := sorted(set(rerun) - set(names)):
+        raise ValueError(f"--rerun: the suite has no algorithms {unknown}; it has {names}.")
     wanted = [spec for spec in specs if spec.algorithm not in rerun]
     return {name: run for path in results for name, run in read_results(path, wanted).items()}
 
@@ -146,10 +148,12 @@ def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]
     :return: run's name -> records of each run that was found, if it was made with the settings and arguments of today's suite
     :raises ValueError: if the results have no record of single runs
     """
-    results = json.loads(path.with_suffix(".json").read_text())
+    results = json.loads(file_of(path, "json").read_text())
     if "runs" not in results:
-        raise ValueError(f"{path}.json does not tell its runs apart: it was aggregated before they could be taken up again.")
-    evaluations = dict(list(read_tidy(path.with_suffix(".csv")).drop(columns=NEEDED, errors="ignore").groupby(NAMES)))
+        raise ValueError(
+            f"{file_of(path, 'json')} does not tell its runs apart: it was aggregated before they could be taken up again."
+        )
+    evaluations = dict(list(read_tidy(file_of(path, "csv")).drop(columns=NEEDED, errors="ignore").groupby(NAMES)))
     return {name_of(spec): _recorded(spec, results, evaluations) for spec in specs if _is_among(results, spec)}
 
 

@@ -9,6 +9,7 @@ prints the ends of all runs, how much they vary, and each algorithm's difference
 
 import argparse
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +20,7 @@ from scipy import stats
 
 from benchmarks.intervals import CONFIDENCE, Difference, difference, mean_interval
 from benchmarks.page.summary import listed
-from benchmarks.tidy import read_tidy
+from benchmarks.tidy import NO_NOISE, file_of, number, read_tidy
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
@@ -178,16 +179,6 @@ def in_words(found: Worth, one: Difference) -> str:
     return f"{number(one.value)} ({number(one.low)} to {number(one.high)} with {CONFIDENCE:.0%} confidence{part})"
 
 
-def number(value: float) -> str:
-    """
-    :param value: return, or difference of returns
-    :return: text with three significant digits, or with all digits before the point if there are more
-    """
-    if value == 0 or abs(value) >= 100:
-        return f"{value:,.0f}"
-    return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
-
-
 def counted(number: int, noun: str) -> str:
     """
     :param number: number of things
@@ -273,10 +264,20 @@ def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
     for (task, noise), cell in tidy.groupby(["task", "noise"], sort=False):
         ends = by_algorithm(cell, end_of)
         for name, of_seeds in ends.items():
-            spread = f"{of_seeds.std(ddof=1) / abs(of_seeds.mean()):.0%}" if len(of_seeds) > 1 else ""
+            spread = f"{of_seeds.std(ddof=1) / abs(of_seeds.mean()):.0%}" if len(of_seeds) > 1 and of_seeds.mean() else ""
             compared = difference(ends, name, reference)[2:] if reference in ends and name != reference else ()
             seeds, over = ", ".join(map(number, of_seeds)), ", ".join(map(number, compared))
-            rows.append([str(task), f"{noise:g}", name, seeds, number(float(of_seeds.mean())), spread, over])
+            rows.append(
+                [
+                    str(task),
+                    "" if noise == NO_NOISE else f"{noise:g}",
+                    name,
+                    seeds,
+                    number(float(of_seeds.mean())),
+                    spread,
+                    over,
+                ]
+            )
     return rows
 
 
@@ -289,7 +290,7 @@ def read_together(paths: Sequence[Path]) -> pd.DataFrame:
     """
     tables: list[pd.DataFrame] = []
     for path in paths:
-        tidy = read_tidy(path.with_suffix(".csv"))
+        tidy = read_tidy(file_of(path, "csv"))
         known = {name for table in tables for name in table.algorithm}
         tables.append(tidy.assign(algorithm=[f"{name} ({path.name})" if name in known else name for name in tidy.algorithm]))
     return pd.concat(tables)
@@ -303,10 +304,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, nargs="+", help="paths of aggregated results, without a suffix")
-    parser.add_argument("--reference", default=ASYMMETRIC, help=f"algorithm to compare with (default: {ASYMMETRIC})")
+    parser.add_argument("--reference", help=f"algorithm to compare with (default: {ASYMMETRIC})")
     options = parser.parse_args(arguments)
-    head = ["task", "noise", "algorithm", "each seed's end", "mean", "spread", f"over {options.reference}: value, low, high"]
-    print(in_columns(head, ends_table(read_together(options.results), options.reference)))
+    try:
+        tidy = read_together(options.results)
+    except (ValueError, OSError) as error:
+        sys.exit(str(error))
+    reference, names = options.reference or ASYMMETRIC, sorted(tidy.algorithm.unique())
+    if options.reference and reference not in names:
+        sys.exit(f"--reference: the results have no algorithm {reference!r}; they have {names}.")
+    head = ["task", "noise", "algorithm", "each seed's end", "mean", "spread", f"over {reference}: value, low, high"]
+    print(in_columns(head, ends_table(tidy, reference)))
 
 
 if __name__ == "__main__":

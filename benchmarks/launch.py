@@ -226,6 +226,9 @@ def main() -> None:
             check_simulators(job.spec for job in jobs)
     except (ValueError, OSError) as error:
         sys.exit(str(error))
+    except KeyboardInterrupt:
+        print("Stopped before the first run.", file=sys.stderr)
+        sys.exit(130)
     left = f"{len(jobs)} left to run, {sum(job.spec.steps for job in jobs):,} environment steps"
     if options.dry_run:
         print("\n".join([*(shlex.join(job.command) for job in jobs), f"# {finished} finished, {left}."]))

@@ -10,7 +10,9 @@ The command reads ``halfcheetah.csv`` and ``halfcheetah.json``. Beside them, it 
 import argparse
 import json
 import os
+import sys
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +22,11 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
 from benchmarks.page.cells import NOT_RUN, grid, is_wanted, palette, returns_range, title_of
+from benchmarks.page.digits import with_all_digits
 from benchmarks.page.document import page
 from benchmarks.page.plots import RETURN, curves, has_guider, steps_label
 from benchmarks.page.plots import interactive as interactive  # the plot of returns on the page, a figure of plotly
-from benchmarks.tidy import NEEDED, read_tidy, with_needed_steps
+from benchmarks.tidy import NEEDED, file_of, number, read_tidy, with_needed_steps
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -75,10 +78,12 @@ def _legend_below(figure: Figure, lines: Mapping[str, Artist]) -> None:
     """Put a legend below the axes, with as many names side by side as the figure has room for."""
     for columns in range(len(lines), 0, -1):
         legend = figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=columns, fontsize="small")
-        if legend.get_window_extent().width <= figure.bbox.width:
+        if legend.get_window_extent().width <= figure.bbox.width or columns == 1:
+            rows = -(-len(lines) // columns)
+            more = legend.get_window_extent().height / figure.dpi * (rows - 1) / rows  # so that the axes keep their height
+            figure.set_figheight(figure.get_figheight() + more)
             return
-        if columns > 1:
-            legend.remove()
+        legend.remove()
 
 
 def cells_table(cells: list[dict[str, Any]]) -> str:
@@ -87,6 +92,7 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
     :return: Markdown table of the final returns
     """
     head = ("task", "noise", "algorithm", "learner, each seed", "mean", "IQM [95%]", "guider", "KL / target: min, mean, max")
+    plain = partial(number, thousands="")
     rows = []
     for cell in cells:
         iqm, low, high = cell["final_iqm"]
@@ -95,12 +101,12 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
             if "kl_over_target_min" in cell
             else ""
         )
-        guider = f"{cell['guider_mean']:.0f}" if "guider_mean" in cell else ""
-        seeds = ", ".join(f"{value:.0f}" for value in cell["final"])
+        guider = plain(cell["guider_mean"]) if "guider_mean" in cell else ""
+        seeds = ", ".join(map(plain, cell["final"]))
         noise = "" if cell["noise"] is None else f"{cell['noise']:g}"
         after = f", after {cell[NEEDED]:,} steps of needed runs" if NEEDED in cell else ""
-        first = (cell["task"], noise, cell["algorithm"] + after, seeds, f"{cell['final_mean']:.0f}")
-        rows.append((*first, f"{iqm:.0f} [{low:.0f}, {high:.0f}]", guider, kl))
+        first = (cell["task"], noise, cell["algorithm"] + after, seeds, plain(cell["final_mean"]))
+        rows.append((*first, f"{plain(iqm)} [{plain(low)}, {plain(high)}]", guider, kl))
     return markdown(head, rows)
 
 
@@ -140,12 +146,15 @@ def main() -> None:
     )
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS, help="of the figure (default: all)")
     options = parser.parse_args()
-    tidy = read_tidy(options.results.with_suffix(".csv"))
+    try:
+        tidy = read_tidy(file_of(options.results, "csv"))
+        results = with_all_digits(json.loads(file_of(options.results, "json").read_text()), tidy)
+    except OSError as error:
+        sys.exit(str(error))
     tidy = tidy.drop(columns=NEEDED, errors="ignore") if options.own_steps else with_needed_steps(tidy)
-    results = json.loads(options.results.with_suffix(".json").read_text())
-    draw(tidy, [options.results.with_suffix(f".{suffix}") for suffix in options.formats], results.get("still_to_run"))
+    draw(tidy, [file_of(options.results, suffix) for suffix in options.formats], results.get("still_to_run"))
     runs = os.path.relpath(options.runs, options.results.parent)
-    options.results.with_suffix(".html").write_text(page(tidy, results, options.results.stem, runs))
+    file_of(options.results, "html").write_text(page(tidy, results, options.results.name, runs))
     print(f"{cells_table(results['cells'])}\n\n{overall_table(results)}")
 
 

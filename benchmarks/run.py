@@ -245,7 +245,13 @@ def main() -> None:
         help="not that run, but the one whose model it needs as this argument",
     )
     options = parser.parse_args()
-    spec = read_suite(options.suite)[options.index]
+    try:
+        specs = read_suite(options.suite)
+    except (ValueError, OSError) as error:
+        sys.exit(str(error))
+    if not 0 <= options.index < len(specs):
+        sys.exit(f"--index: {options.suite} has runs from 0 to {len(specs) - 1}, got {options.index}.")
+    spec = specs[options.index]
     for argument in options.needed:
         spec = needed_runs(spec)[argument]
     print(run(spec, options.runs, progress_bar=sys.stderr.isatty()))

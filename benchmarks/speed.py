@@ -39,6 +39,7 @@ from benchmarks.models import (
 )
 from benchmarks.pixels import tabulate_image_steps, tabulate_pixels
 from benchmarks.profiles import env_step, profile_rollout, profile_step
+from benchmarks.tidy import file_of
 from sb3_gac.training.provenance import provenance
 
 GROWTH_CONTENDERS = ("sac", "gac", "gac-compiled")
@@ -374,7 +375,7 @@ def main() -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     for name in options.tables:
         record[name] = TABLES[name](options.threads, options.quick)
-        options.out.with_suffix(".json").write_text(json.dumps(record, indent=1))
+        file_of(options.out, "json").write_text(json.dumps(record, indent=1))
         print(f"\n{name}\n\n{markdown(record[name])}", flush=True)
 
 

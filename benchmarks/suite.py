@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from benchmarks.yaml_checks import check_is, check_keys, check_list, check_numbers
+from benchmarks.yaml_checks import check_is, check_keys, check_list, check_numbers, read_yaml
 from sb3_gac.presets import read_preset
 
 HERE = Path(__file__).parent
@@ -96,7 +96,8 @@ class RunSpec:
         there = UNSAID | yaml.safe_load((directory / "config.yaml").read_text())["run"]
         changed = sorted(key for key, value in asdict(self).items() if there.get(key) != value)
         if changed:
-            raise ValueError(f"{directory} holds a run with other settings under {changed}: remove it, or use another --runs.")
+            hint = "remove it, or use another directory (--runs, or --out of a comparison)"
+            raise ValueError(f"{directory} holds a run with other settings under {changed}: {hint}.")
         return True
 
 
@@ -154,10 +155,7 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
     :return: settings of its runs: one list for each noise of each entry of ``cells``
     :raises ValueError: if a key is unknown or missing, or a run is listed twice
     """
-    try:
-        suite = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path.name} is not YAML: {error}") from None
+    suite = read_yaml(path)
     check_is(path.name, suite, "a mapping", Mapping)
     if "preset" in suite:
         suite = {**read_preset(suite["preset"]).run, **suite}
@@ -195,7 +193,7 @@ def _check_distinct(name: str, specs: list[RunSpec]) -> None:
 
 def read_definitions() -> dict[str, Any]:
     """The content of ``hyperparams/algorithms.yml``: algorithm's name -> its class, arguments, and the runs that it needs."""
-    definitions: dict[str, Any] = yaml.safe_load((HYPERPARAMS / "algorithms.yml").read_text())
+    definitions: dict[str, Any] = read_yaml(HYPERPARAMS / "algorithms.yml")
     return definitions
 
 
@@ -259,6 +257,7 @@ class _Reader:
         check_keys(where, cell, _TASK_KEYS, _TASK_KEYS - {"needs", "history"})
         if "history" in cell:
             check_is(f"{where}, history", cell["history"], "a whole number above 1", int, lambda number: number > 1)
+        check_is(f"{where}, task", cell["task"], "the name of a task, as in Hopper", str, len)
         check_list(f"{where}, noises", cell["noises"], "numbers", (int, float))
         return None, cell["task"], [float(noise) for noise in cell["noises"]]
 
@@ -266,7 +265,7 @@ class _Reader:
         """For each algorithm, the definition that the suite has of it, and the runs that it needs."""
         changes = cell.get("needs", {})
         check_is(f"{where}, needs", changes, "a mapping", Mapping)
-        if unknown := sorted(set(changes) - set(cell["algorithms"])):
+        if unknown := sorted(map(str, set(changes) - set(cell["algorithms"]))):
             raise ValueError(f"{where}, needs: the cell has no algorithms {unknown}; it has {cell['algorithms']}.")
         return {
             name: {

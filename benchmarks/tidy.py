@@ -1,13 +1,26 @@
-"""The table of evaluations that ``aggregate`` writes and other programs read."""
+"""The table of evaluations that ``aggregate`` writes and other programs read, the scores of its runs, and their digits."""
 
+import math
 from pathlib import Path
 
 import pandas as pd
 
+#: The columns that together identify a cell of a suite, and those that identify a run
+CELL = ["task", "noise"]
+NAMES = [*CELL, "algorithm", "seed"]
 #: Value that stands for the noise of environments that take no sensor noise; in files the field is empty
 NO_NOISE = -1.0
 #: Column with the environment steps of the runs that a run needs
 NEEDED = "needed_steps"
+
+
+def file_of(results: Path, suffix: str) -> Path:
+    """
+    :param results: path of results, without a suffix; a dot in their name, as in ``noise0.1``, begins none
+    :param suffix: suffix of one of their files, without its dot
+    :return: path of that file
+    """
+    return results.with_name(f"{results.name}.{suffix}")
 
 
 def read_tidy(path: Path) -> pd.DataFrame:
@@ -24,3 +37,55 @@ def with_needed_steps(tidy: pd.DataFrame) -> pd.DataFrame:
     :return: the same table, with ``timesteps`` counted from the start of the first run that a run needs
     """
     return tidy.assign(timesteps=tidy.timesteps + tidy[NEEDED]) if NEEDED in tidy else tidy
+
+
+def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
+    """
+    :param tidy: evaluations, see :func:`read_tidy`
+    :return: table with one row for each run: "final", the mean return of the last evaluation, and "area", the mean return over
+        all evaluations, which is the area under the curve divided by its length
+    """
+    by_run = tidy.sort_values("timesteps", kind="stable").groupby(NAMES, sort=False)
+    return by_run.learner.agg(final="last", area="mean").reset_index()
+
+
+def normalised_scores(tidy: pd.DataFrame) -> pd.DataFrame:
+    """
+    Normalise the returns of each cell, from the lowest point of its curves to its best end. A constant that is added to all
+    returns, or a positive factor, changes nothing.
+
+    :param tidy: evaluations, see :func:`read_tidy`
+    :return: table of :func:`run_scores` with three more columns: "low", the lowest mean over seeds of any algorithm at any
+        evaluation in the cell; "high", the best algorithm's mean final return in the cell; and "normalised", the final return
+        on a scale with "low" at 0 and "high" at 1
+    """
+    scores = run_scores(tidy)
+    low = tidy.groupby([*CELL, "algorithm", "timesteps"]).learner.mean().groupby(CELL).min()
+    high = scores.groupby([*CELL, "algorithm"]).final.mean().groupby(CELL).max()
+    scores = scores.merge(pd.DataFrame({"low": low, "high": high}).reset_index(), on=CELL)
+    span = (scores.high - scores.low).replace(0.0, 1.0)  # where no returns differ, all algorithms are the best
+    return scores.assign(normalised=1 - (scores.high - scores.final) / span)
+
+
+def significant(value: float) -> float:
+    """
+    :param value: score, of any size
+    :return: the same score with six significant digits, as many as the table of evaluations has
+    """
+    return float(f"{value:.6g}")
+
+
+def number(value: float, thousands: str = ",") -> str:
+    """
+    :param value: return, or difference of returns
+    :param thousands: what separates thousands, a comma or nothing
+    :return: text with three significant digits, or with all digits before the point if there are more
+    """
+    if value == 0:
+        return "0"  # and never -0
+    if not math.isfinite(value) or abs(value) >= 100:
+        return f"{value:{thousands}.0f}"
+    rounded = float(f"{value:.3g}")  # 99.96 is 100
+    if abs(rounded) < 1e-3:
+        return f"{rounded:g}"
+    return f"{rounded:.{max(0, 2 - math.floor(math.log10(abs(rounded))))}f}"

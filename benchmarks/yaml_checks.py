@@ -1,7 +1,37 @@
-"""Checks of values that were read from YAML, with errors that name the key in the file."""
+"""Reads YAML whose keys differ, and checks its values, with errors that name the key in the file."""
 
+import math
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
+
+import yaml
+
+
+class _DistinctKeys(yaml.SafeLoader):
+    """A loader for which a key that comes twice in a mapping is an error; YAML's own keeps the last one in silence."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return the mapping of a node; a key that comes after ``<<`` may replace one that was merged."""
+        keys = [(key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for index, (key, _) in enumerate(node.value):
+            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in keys[:index]:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key.value!r} comes twice in a mapping: remove or rename one", key.start_mark
+                )
+        return super().construct_mapping(node, deep)
+
+
+def read_yaml(path: Path) -> Any:
+    """
+    :param path: YAML file
+    :return: content of the file
+    :raises ValueError: naming the line, if the file is not YAML, or if a key comes twice in a mapping
+    """
+    try:
+        return yaml.load(path.read_text(), _DistinctKeys)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path.name} is not YAML: {error}") from None
 
 
 def check_list(where: str, values: Any, what: str, kinds: type | tuple[type, ...]) -> None:
@@ -10,11 +40,11 @@ def check_list(where: str, values: Any, what: str, kinds: type | tuple[type, ...
     :param values: value that was read from YAML
     :param what: description of the elements, for an error message, such as "whole numbers"
     :param kinds: types that an element may have
-    :raises ValueError: if the value is no list, if the list is empty, or if an element has another type or is a number below 0
+    :raises ValueError: if the value is no list or an empty one, or if an element has another type, is infinite or below 0
     """
     check_is(where, values, f"a list of at least one of {what}", list, len)
     for value in values:
-        check_is(where, value, f"{what}, each", kinds, lambda value: isinstance(value, str) or value >= 0)
+        check_is(where, value, f"{what}, each", kinds, lambda value: isinstance(value, str) or 0 <= value < math.inf)
 
 
 def check_numbers(where: str, value: Any, is_meant: Callable[[Any], Any] | None = None) -> None:
@@ -70,6 +100,6 @@ def check_keys(where: str, mapping: Mapping[str, Any], known: set[str], required
     :param required: keys that the mapping must have
     :raises ValueError: if a key is unknown or missing
     """
-    unknown, missing = sorted(set(mapping) - known), sorted(required - set(mapping))
+    unknown, missing = sorted(map(str, set(mapping) - known)), sorted(required - set(mapping))
     if unknown or missing:
         raise ValueError(f"{where}: unknown keys {unknown}, missing keys {missing}; the keys are {sorted(known)}.")

@@ -153,9 +153,10 @@ def plots(
         gap = tidy.assign(gap=tidy.guider - tidy.learner).dropna(subset="gap")
         lines = partial(_mean_line, "gap")
         drawn.append(_plot("Guider over learner", gap, lines, "guider's return - learner's", steps, _GAP, to_run))
-    if {"kl", "target_kl"} <= set(tidy) and tidy.kl.notna().any():
+    if {"kl", "target_kl"} <= set(tidy):
         ratio = tidy.assign(ratio=tidy.kl / tidy.target_kl).dropna(subset="ratio")
-        drawn.append(_plot("KL", ratio, partial(_mean_line, "ratio"), "KL / target_kl", steps, _KL, to_run))
+        if not ratio.empty:
+            drawn.append(_plot("KL", ratio, partial(_mean_line, "ratio"), "KL / target_kl", steps, _KL, to_run))
     if not normalised.empty:
         drawn.append(_profile(normalised))
     return drawn

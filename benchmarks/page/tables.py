@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.intervals import mean_interval
+from benchmarks.tidy import number
 
 #: Largest number of seeds whose interquartile mean is their mean
 SAME_MEAN = 3
@@ -33,13 +34,13 @@ class Field(NamedTuple):
         return f'<td class=number data-value="{self.value:.6g}">{html.escape(self.text)}</td>'
 
 
-def number(value: float | None, digits: int = 0) -> Field:
+def field(value: float | None, shown: str = "") -> Field:
     """
     :param value: number to show, ``None`` for an empty field, which is sorted below all others
-    :param digits: digits after the point
+    :param shown: format of the number; where it is empty, a return of any size has at least three digits
     :return: field of the number
     """
-    return Field("", -math.inf) if value is None else Field(f"{value:,.{digits}f}", value)
+    return Field("", -math.inf) if value is None else Field(f"{value:{shown}}" if shown else number(value), value)
 
 
 def table(head: Sequence[str], rows: Sequence[tuple[Sequence[Field], bool]], sortable: bool = True) -> str:
@@ -91,20 +92,21 @@ def _best(cells: Sequence[Mapping[str, Any]]) -> set[int]:
 
 def _returns(cell: Mapping[str, Any]) -> Iterator[Field]:
     yield Field(cell["task"])
-    yield number(cell["noise"], 2)
+    yield field(cell["noise"], "g")
     yield Field(
         cell["algorithm"] + (f", after {cell['needed_steps']:,} steps of needed runs" if "needed_steps" in cell else "")
     )
-    yield number(cell["final_mean"])
+    yield field(cell["final_mean"])
     _, low, high = mean_interval(np.array(cell["final"], dtype=float))
-    yield Field("one seed" if math.isinf(low) else f"{low:,.0f} to {high:,.0f}")
+    yield Field("one seed" if math.isinf(low) else f"{number(low)} to {number(high)}")
     iqm, low, high = cell["final_iqm"]
-    yield Field(f"{iqm:.0f} [{low:.0f}, {high:.0f}]", iqm) if len(cell["final"]) > SAME_MEAN else number(None)
-    yield Field(", ".join(f"{value:,.0f}" for value in cell["final"]))
-    yield number(cell["area_iqm"][0])
-    yield number(cell.get("guider_mean"))
-    yield number(cell.get("kl_over_target_mean"), 2)
-    yield number(cell["steps_to_reference"])
+    interval = f"{number(iqm)} [{number(low)}, {number(high)}]"
+    yield Field(interval, iqm) if len(cell["final"]) > SAME_MEAN else field(None)
+    yield Field(", ".join(map(number, cell["final"])))
+    yield field(cell["area_iqm"][0])
+    yield field(cell.get("guider_mean"))
+    yield field(cell.get("kl_over_target_mean"), ",.2f")
+    yield field(cell["steps_to_reference"], ",")
 
 
 def overall_table(results: Mapping[str, Any]) -> str:
@@ -119,7 +121,7 @@ def overall_table(results: Mapping[str, Any]) -> str:
     for name in names:
         value, low, high = results["normalised_iqm"][name]
         others = [_improvement(results["probability_of_improvement"].get(f"{name} over {other}")) for other in names]
-        rows.append(([Field(name), number(value, 2), Field(f"{low:.2f} to {high:.2f}"), *others], name == names[0]))
+        rows.append(([Field(name), field(value, ",.2f"), Field(f"{low:.2f} to {high:.2f}"), *others], name == names[0]))
     return table(head, rows)
 
 

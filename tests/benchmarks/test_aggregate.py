@@ -1,12 +1,18 @@
 """Scores of finished runs, by hand."""
 
+import math
+from contextlib import nullcontext
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
 
 import benchmarks.bootstrap
-from benchmarks.aggregate import choose_reference, compare, normalised_scores, run_scores, summarise_cells
+from benchmarks.aggregate import check_finite, choose_reference, compare, main, normalised_scores, run_scores, summarise_cells
 from benchmarks.bootstrap import interval
+from benchmarks.finished import FinishedRun
+from benchmarks.suite import RunSpec
 
 
 @pytest.fixture(autouse=True)
@@ -33,8 +39,8 @@ def test_summary_by_hand():
     ours, theirs = summarise_cells(tidy, reference="sac-asym")
     assert (ours["seeds"], ours["final"]) == ([0, 1, 2, 3, 4], [10, 20, 22, 40, 400])
     assert ours["final_mean"] == 98.4
-    assert ours["final_iqm"][0] == 27.3, "(20 + 22 + 40) / 3; the median is 22"
-    assert ours["area_iqm"][0] == 34.7, "(25 + 34 + 45) / 3, of means over the two evaluations"
+    assert ours["final_iqm"][0] == 27.3333, "(20 + 22 + 40) / 3; the median is 22"
+    assert ours["area_iqm"][0] == 34.6667, "(25 + 34 + 45) / 3, of means over the two evaluations"
     assert (ours["steps_to_reference"], theirs["steps_to_reference"]) == (5_000, 10_000)
     assert ours["guider_mean"] == 99.4
     assert (ours["kl_over_target_min"], ours["kl_over_target_mean"], ours["kl_over_target_max"]) == (0.8, 1.4, 2.0)
@@ -164,3 +170,31 @@ def test_the_probability_of_the_other_way_round_is_the_complement():
         point, low, high = chances[f"{one} over {other}"]
         assert chances[f"{other} over {one}"] == pytest.approx([1 - point, 1 - high, 1 - low], abs=2e-3)
         assert low <= point <= high
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"learner": [1.0, math.nan]}, "gac/seed3, after 20 steps: learner is nan"),
+        ({"learner": [-math.inf, 1.0]}, "gac/seed3, after 10 steps: learner is -inf"),
+        ({"guider": [1.0, math.inf]}, "gac/seed3, after 20 steps: guider is inf"),
+        ({"kl": [math.nan, 0.1], "target_kl": [math.nan, 0.0]}, "gac/seed3, after 20 steps: kl / target_kl is inf"),
+        ({"kl": [math.nan, 0.1], "target_kl": [math.nan, 0.1]}, ""),
+    ],
+)
+def test_a_run_whose_numbers_cannot_be_averaged_is_named(change, message):
+    spec = RunSpec("gac", "Hopper", 0.1, 3, 20, 1, "small", 10, 1)
+    rows = pd.DataFrame({"timesteps": [10, 20], "learner": [1.0, 2.0], **change})
+    with pytest.raises(ValueError, match=message) if message else nullcontext():
+        check_finite([FinishedRun(spec, rows, {}, [], 1.0, 1)])
+
+
+def test_results_are_not_begun_without_their_runs(tmp_path):
+    suite = Path(__file__).parents[2] / "benchmarks/suites/smoke.yml"
+    for more, message in (
+        ([], "4 runs are not finished"),
+        (["--rerun", "gca"], r"--rerun: the suite has no algorithms \['gca'\]; it has \['gac', 'sac-asym'\]"),
+    ):
+        with pytest.raises(SystemExit, match=message):
+            main([str(suite), "--runs", str(tmp_path), "--out", str(tmp_path / "made"), *more])
+    assert not list(tmp_path.iterdir())

@@ -3,6 +3,7 @@
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import yaml
 from benchmarks import comparison, launch
 from benchmarks.comparison import command, main, parse_arguments, suite_of_options
 from benchmarks.run import run
-from benchmarks.suite import read_suite
+from benchmarks.suite import RunSpec, read_suite
 
 SPLIT = "sb3_gac.envs:SplitObservation: {partial: [0, 1], privileged: [2]}"
 SMALL = "{learning_starts: 20, batch_size: 4, gradient_steps: 1, policy_kwargs: {net_arch: [4]}}"
@@ -159,6 +160,9 @@ def test_a_function_that_makes_an_environment(engine, monkeypatch, tmp_path):
         (["--env", "NoSuchEnvironment-v7"], "NoSuchEnvironment"),
         (["--env", "no_such_module:make"], "no_such_module"),
         ([*SHORT, "--overrides", "{gama: 0.9}"], "gama"),
+        ([*SHORT, "--overrides", "{1: 2, foo: 3}"], "has no arguments ['1', 'foo']"),
+        (["--env", "Pendulum-v1", "--wrappers", "5"], "wrappers: must be module:Class"),
+        ([*SHORT, "--out", __file__], "File exists"),
         (["--env", "sb3_gac/FetchReach-v4", "--env-kwargs", "{goal_entries: true}"], "sb3_gac.envs:AppendDesiredGoal"),
     ],
 )
@@ -182,6 +186,33 @@ def test_bad_options_are_named(capsys, arguments, message):
     with pytest.raises(SystemExit):
         parse_arguments(None, ["--env", "m:make", *arguments])
     assert message in capsys.readouterr().err
+
+
+def test_returns_of_random_actions_are_read_again_only_where_they_are_of_the_same_environment(tmp_path, monkeypatch):
+    played = []
+    monkeypatch.setattr(comparison, "evaluate_policy", lambda *_, **__: (played.append(1) or [float(len(played))], []))
+    path = tmp_path / "random.json"
+    spec = RunSpec("sac", "Pendulum", 0.1, 0, 60, 1, "small", 20, 1)
+    own = {"id": "Pendulum-v1", "kwargs": {"g": 9.0}, "wrappers": []}
+    specs = [
+        spec,
+        replace(spec, noise=0.2),
+        replace(spec, history=3),
+        replace(spec, environment=own),
+        replace(spec, environment=own | {"kwargs": {"g": 1.0}}),
+        replace(spec, environment=own | {"wrappers": [{"gymnasium.wrappers:ClipAction": {}}]}),
+    ]
+    for number, other in enumerate(specs, 1):
+        assert [comparison.random_returns(other, path).tolist() for _ in range(2)] == [[number], [number]]
+    assert comparison.random_returns(replace(specs[-1], seed=3, algorithm="gac"), path).tolist() == [len(specs)]
+    path.write_text("[5.0]")
+    assert comparison.random_returns(spec, path).tolist() == [len(specs) + 1], "a file of an earlier version says not of what"
+
+
+def test_a_history_of_the_newest_observation_alone_is_none():
+    for length, cell in ((1, {}), (2, {"history": 2})):
+        (made,) = _suite("--env", "sb3_gac/Pendulum-v1", "--env-kwargs", f"{{history: {length}}}")["cells"]
+        assert {key: value for key, value in made.items() if key == "history"} == cell
 
 
 def test_a_run_that_fails_is_named_with_its_log(engine, monkeypatch):

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from benchmarks.headroom import (
     ends_table,
@@ -17,6 +18,7 @@ from benchmarks.headroom import (
     seeds_to_see,
     worth,
 )
+from benchmarks.tidy import NO_NOISE
 
 RANDOM = np.array([-2.0, 0.0, 2.0, 0.0])
 
@@ -154,3 +156,25 @@ def test_the_command_prints_the_committed_results(capsys):
     out = capsys.readouterr().out
     assert "over sac: value, low, high" in out
     assert "2,386, 1,939, 2,833" in out, "of SAC-asym at noise 0.1, as docs/results.md has it"
+
+
+def test_a_task_without_noise_has_an_empty_field_and_returns_of_0_no_spread(recwarn):
+    tidy = _tidy({"sac-asym": [0.0, 0.0]}).assign(noise=NO_NOISE)
+    assert ends_table(tidy, "sac-asym") == [["T", "", "sac-asym", "0, 0", "0", "", ""]]
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["made", "--reference", "nosuch"], r"--reference: the results have no algorithm 'nosuch'; they have \['gac'\]"),
+        (["gone"], r"No such file .*gone\.csv"),
+    ],
+)
+def test_what_does_not_exist_is_said_in_a_line(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    _tidy({"gac": [1.0, 2.0]}).assign(noise=0.1).to_csv("made.csv", index=False)
+    with pytest.raises(SystemExit, match=message):
+        main(arguments)
+    main(["made"])
+    assert "over sac-asym" in capsys.readouterr().out, "the default need not be among the algorithms"

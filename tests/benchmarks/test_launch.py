@@ -13,6 +13,7 @@ import pytest
 import yaml
 from rich.console import Console
 
+import benchmarks.run
 from benchmarks import launch
 from benchmarks.config import check_simulators
 from benchmarks.engines import run_process
@@ -185,6 +186,24 @@ def test_a_suite_that_is_no_yaml_file_is_one_message(text, tmp_path, monkeypatch
     monkeypatch.setattr(sys, "argv", ["launch", str(path), "--runs", str(tmp_path), "--dry-run"])
     with pytest.raises(SystemExit, match=r"broken\.yml"):
         launch.main()
+
+
+def test_ctrl_c_while_the_suite_is_checked_is_one_line(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(launch, "jobs_left", interrupted)
+    monkeypatch.setattr(sys, "argv", ["launch", str(SMOKE)])
+    with pytest.raises(SystemExit) as stop:
+        launch.main()
+    assert (stop.value.code, capsys.readouterr().err) == (130, "Stopped before the first run.\n")
+
+
+@pytest.mark.parametrize("index", [-1, 4])
+def test_an_index_beyond_the_suite_is_one_message(index, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["run", "--suite", str(SMOKE), f"--index={index}"])
+    with pytest.raises(SystemExit, match=f"--index: .*smoke.yml has runs from 0 to 3, got {index}"):
+        benchmarks.run.main()
 
 
 def test_a_dry_run_counts(tmp_path, monkeypatch, capsys):

@@ -69,13 +69,13 @@ def test_a_single_algorithm_is_compared_with_nothing():
 
 def test_the_returns_table_has_students_interval_and_the_best_in_bold():
     shown = returns_table(_results()["cells"])
-    assert "<td class=short-text>0 to 10</td>" in shown, "5 -+ 4.3027 * 2 / sqrt(3)"
+    assert "<td class=short-text>0.0317 to 9.97</td>" in shown, "5 -+ 4.3027 * 2 / sqrt(3)"
     assert shown.count("class=best") == 2
     assert "guider" not in shown, "a column of which all fields are empty"
     assert "guider" in returns_table([_cell("gac", [1.0], guider_mean=2.0)])
     assert "one seed" in returns_table([_cell("gac", [1.0])])
     assert "IQM" not in shown, "which is the mean of three seeds"
-    assert "4 [1, 9]" in returns_table([_cell("gac", [1.0, 2.0, 4.0, 8.0])])
+    assert "4.15 [1.00, 9.00]" in returns_table([_cell("gac", [1.0, 2.0, 4.0, 8.0])])
 
 
 def test_the_better_algorithm_is_the_first_row_of_the_overall_table():

@@ -34,6 +34,7 @@ from benchmarks.finished import kind_of, name_of, names_of, particulars_of, read
 from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
 from benchmarks.suite import RunSpec, made_with, read_suite
+from benchmarks.yaml_checks import read_yaml
 from sb3_gac import GAC, PRESETS, preset
 from sb3_gac.checkpoint.lock import locked
 from sb3_gac.checks.arguments import constructor_parameters
@@ -285,6 +286,17 @@ def test_a_failing_run_is_named_with_its_log(tmp_path, program):
         ({"cells": [CELL | {"noises": ["1e-1"]}]}, "cell 1, noises: must be numbers, each, got '1e-1'. YAML reads"),
         ({"cells": [CELL | {"algorithms": "gac"}]}, "cell 1, algorithms: must be a list of at least one of names, got 'gac'"),
         ({"cells": [CELL | {"algorithms": [1]}]}, "cell 1, algorithms: must be names, each, got 1"),
+        *(
+            ({"cells": [CELL | {"task": task}]}, r"cell 1, task: must be the name of a task, as in Hopper, got")
+            for task in (5, ["Hopper"], None)
+        ),
+        (
+            {"cells": [CELL | {"noises": [0.1, float("inf")]}]},
+            "cell 1, noises: must be numbers, each, got inf",
+        ),
+        ({"cells": [CELL | {"noises": [float("nan")]}]}, "cell 1, noises: .*got nan"),
+        ({1: 2, "foo": 3}, r"suite.yml: unknown keys \['1', 'foo'\]"),
+        ({True: 3, "foo": 3}, r"suite.yml: unknown keys \['True', 'foo'\]"),
     ],
 )
 def test_unknown_and_missing_keys_are_refused(tmp_path, change, message):
@@ -304,7 +316,20 @@ def test_unknown_and_missing_keys_are_refused(tmp_path, change, message):
         ({"cells": [CELL, CELL | {"task": "popgym-AutoencodeEasy"}]}, "popgym-AutoencodeEasy has no sensor noise"),
         ({"overrides": {"lerning_rate": 1}}, r"gac: GAC has no arguments \['lerning_rate'\]; it has .*'learning_rate'"),
         ({"overrides": {"learning_rate": "1e-3"}}, "gac, learning_rate: YAML reads '1e-3' as text.*1.0e-3"),
-        ({"overrides": {"policy": "MlpPolicy"}}, "gac: policy must be one of .*'MultiInputPolicy'.*got 'MlpPolicy'"),
+        ({"overrides": {"policy": "MlpPolicy"}}, "gac: policy: must be one of .*'MultiInputPolicy'.*got 'MlpPolicy'"),
+        ({"overrides": {"policy": ["x"]}}, r"gac: policy: must be one of .*got \['x'\]"),
+        ({"overrides": {"policy_kwargs": "abc"}}, "gac: policy_kwargs: must be a mapping.*got 'abc'"),
+        ({"overrides": {"policy_kwargs": [1]}}, r"gac: policy_kwargs: must be a mapping.*got \[1\]"),
+        ({"overrides": {1: 2, "foo": 3}}, r"gac: GAC has no arguments \['1', 'foo'\]"),
+        ({"overrides": {"seed": 33}}, "gac: seed is no argument of a suite: list seeds in the cell"),
+        ({"overrides": {"device": "cuda"}}, "gac: device is no argument of a suite: all runs are made on the CPU"),
+        (
+            {
+                "algorithms": {"mine": {"class": "gac", "normalize": {"clip_ob": 5.0}}},
+                "cells": [CELL | {"algorithms": ["mine"]}],
+            },
+            "Hopper-noise0.1, mine: TypeError: .*clip_ob",
+        ),
         ({"overrides": {"batch_size": 0}}, "Hopper-noise0.1, gac: batch_size must be .*got 0"),
         ({"overrides": {"buffer_size": -1}}, "gac: buffer_size must be .*got -1"),
         ({"overrides": {"learning_rate": "fast"}}, "gac: learning_rate must be .*'fast' is no schedule"),
@@ -333,6 +358,27 @@ def test_launch_says_what_is_wrong_with_a_suite_in_one_line(tmp_path):
     assert (result.returncode, result.stdout) == (1, "")
     assert len(result.stderr.splitlines()) == 1
     assert result.stderr.startswith("typo.yml: task must be one of")
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "line"),
+    [
+        ("steps: 10\ncells: []\nenvs: 1\ncells: []\n", "cells", 4),
+        ("overrides: {tau: 0.1}\ncells:\n- {task: Hopper, seeds: [0], task: Ant}\n", "task", 3),
+        ("overrides: {policy_kwargs: {net_arch: [8], n: 1, net_arch: [4]}}\n", "net_arch", 1),
+    ],
+)
+def test_a_key_that_comes_twice_is_refused_with_its_line(text, key, line, tmp_path):
+    """YAML's own loader keeps the last one alone, and half of a suite is gone."""
+    path = tmp_path / "twice.yml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"twice.yml is not YAML: the key '{key}' comes twice(.|\n)*line {line},"):
+        read_suite(path)
+
+
+def test_a_key_may_replace_a_merged_one(tmp_path):
+    (tmp_path / "merged.yml").write_text("base: &base {a: 1, b: 2}\nother: {<<: *base, a: 3}\n")
+    assert read_yaml(tmp_path / "merged.yml")["other"] == {"a": 3, "b": 2}
 
 
 @pytest.mark.parametrize("suite", SUITES, ids=[path.stem for path in SUITES])
@@ -698,7 +744,7 @@ def test_a_finished_run_with_other_settings_is_neither_skipped_nor_counted(tmp_p
     assert (directory / "evaluations.csv").read_text() == "done", "left alone"
     (directory / "config.yaml").write_text(yaml.safe_dump({"run": {**asdict(spec), "eval_episodes": 7}}))
     for program in (lambda: run(spec, tmp_path), lambda: jobs_left(SMOKE, tmp_path), lambda: finished_runs(SMOKE, tmp_path)):
-        with pytest.raises(ValueError, match=r"other settings under \['eval_episodes'\]: remove it, or use another --runs"):
+        with pytest.raises(ValueError, match=r"under \['eval_episodes'\]: remove it, .* \(--runs, or --out of a comparison\)"):
             program()
 
 
