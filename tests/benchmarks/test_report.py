@@ -131,7 +131,7 @@ def _rounded(value):
     if isinstance(value, dict):
         return {key: _rounded(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_rounded(inner) for inner in value]
+        return type(value)(map(_rounded, value))
     return pytest.approx(value, abs=0.0501) if isinstance(value, float) else value
 
 
