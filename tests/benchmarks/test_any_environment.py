@@ -150,7 +150,7 @@ def test_from_suite_to_report_beside_a_task_with_noise(suite, tmp_path, monkeypa
         jobs_left(changed, runs)
 
     _main(monkeypatch, benchmarks.report, out)
-    assert "| my-line |  | gac | 12 |" in capsys.readouterr().out
+    assert "| my-line |  | gac | 12.0 |" in capsys.readouterr().out
     page = out.with_suffix(".html").read_text()
     assert '"text": "my-line"' in page
     assert '"text": "Pendulum, noise 0.1"' in page
