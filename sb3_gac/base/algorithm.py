@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_gac.base.acting import BehaviourState
 from sb3_gac.base.arguments import ConstructorArguments, present_names
@@ -220,15 +221,24 @@ class AsymmetricAlgorithm(
         for name in set(self.frozen_arguments) - set(self.frozen):
             source = getattr(self, name)
             if source is not None:
-                self.frozen[name] = load_frozen_policy(source, self.observation_space, self.action_space, self.device, name)
+                teacher = load_frozen_policy(source, self.observation_space, self.action_space, self.device, name)
+                _check_scale(name, teacher, self.env)
+                self.frozen[name] = teacher
             elif needed:
                 raise ValueError(
                     f"{type(self).__name__} trains with a {name}: pass {name}=<a trained model or its path>, to load() and "
                     "resume() as well."
                 )
-        for name, frozen in self.frozen.items():
-            assert self.env is not None
-            check_same_scale(name, frozen.policy.observation_space.spaces, frozen.normalised, self.env)  # type: ignore
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        See SB3's ``set_env``.
+
+        :raises ValueError: if a teacher was trained on observations of another scale; the model keeps its environments
+        """
+        for name, teacher in self.frozen.items():
+            _check_scale(name, teacher, env)
+        super().set_env(env, force_reset)
 
     # --- save and load ----------------------------------------------------------------------------------------------
 
@@ -297,3 +307,7 @@ class AsymmetricAlgorithm(
             state_dicts += [f"{name}_dual.{attribute}" for attribute in of_optimizers]
             tensors += [f"{name}_dual.{attribute}" for attribute in of_tensors]
         return state_dicts, tensors
+
+
+def _check_scale(name: str, teacher: FrozenPolicy, env: Any) -> None:
+    check_same_scale(name, teacher.policy.observation_space.spaces, teacher.normalised, env)  # type: ignore[attr-defined]
