@@ -59,9 +59,8 @@ class FrozenPolicy(nn.Module):
         space = policy.observation_space
         key, *_ = space.spaces
         leading = obs[key].shape[: leading_dimensions(obs[key], space[key])]
-        rows = {
-            key: obs[key].flatten(0, len(leading) - 1) for key in space.spaces
-        }  # SB3's encoder knows one leading dimension
+        # SB3's encoder knows one leading dimension
+        rows = {key: obs[key].flatten(0, len(leading) - 1) for key in space.spaces}
         entries = {key: encode(values, space[key], policy.normalize_images) for key, values in rows.items()}
         latent = policy.actor.latent_pi(policy.actor.features_extractor(entries))
         mean, log_std = policy.actor.mu(latent), policy.actor.log_std(latent).clamp(-20, 2)

@@ -25,7 +25,8 @@ def entries_normalised_in_training(model: Any) -> tuple[str, ...] | None:
     :return: names of the entries; ``None`` if they are not known, as of a model of SB3's without environments
     """
     if hasattr(model, "normalised_entries"):
-        return model.normalised_entries
+        is_of_an_earlier_version = model.normalised_entries is None and model.trained_normalised
+        return tuple(model.observation_space.spaces) if is_of_an_earlier_version else model.normalised_entries
     return None if model.env is None else entries_normalised_by(model.env)
 
 

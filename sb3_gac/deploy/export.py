@@ -18,6 +18,7 @@ from torch import nn
 
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.checks.entries import computable
+from sb3_gac.checks.scale import entries_normalised_in_training
 from sb3_gac.checks.values import check_positive, index_bounds
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import check_agreement, draw_observations
@@ -151,8 +152,7 @@ def export_learner(
 def _normalizer_of(model: AsymmetricAlgorithm) -> DeploymentNormalizer | None:
     vec_normalize = model.get_vec_normalize_env()
     keys = model.policy.role_keys[model.policy.roles.deployed]
-    normalised = keys if model.normalised_entries is None else model.normalised_entries  # files of earlier versions lack it
-    if vec_normalize is None and model.trained_normalised and not set(keys).isdisjoint(normalised):
+    if vec_normalize is None and not set(keys).isdisjoint(entries_normalised_in_training(model) or ()):
         raise ValueError(
             "The model learned from observations that VecNormalize normalised, but was loaded without it: load it with "
             'env=VecNormalize.load("<its statistics>", venv), or pass normalizer=DeploymentNormalizer.from_vec_normalize(...).'

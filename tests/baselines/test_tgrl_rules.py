@@ -315,3 +315,11 @@ def test_sb3s_own_may_teach_a_policy_with_a_memory(cls):
 def test_a_teacher_that_explores_by_gsde_is_refused():
     with pytest.raises(ValueError, match="teacher explores by gSDE"):
         FrozenPolicy(_sac(TwoViewBandit(), use_sde=True))
+
+
+def test_a_file_of_an_earlier_version_says_that_it_was_normalised_and_not_which_entries():
+    teacher = _teacher(_normalised()).learn(20)
+    teacher.normalised_entries = None
+    with pytest.raises(ValueError, match='"partial" that was normalised by VecNormalize, but env gives it raw'):
+        small_model(TwoViewBandit(), TGRL, teacher=teacher)
+    assert small_model(_normalised(), TGRL, teacher=teacher).frozen
