@@ -11,6 +11,7 @@ measurements of a pair alike, since they follow each other. The results are the 
 import argparse
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -149,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     print(json.dumps(rows[-1]), flush=True)
     if options.out is not None:
         record = {
-            "command": " ".join(["python -m benchmarks.versus", options.checkout.name, *sys.argv[2:]]),
+            "command": shlex.join(["python", "-m", "benchmarks.versus", options.checkout.name, *sys.argv[2:]]),
             "there": commit(options.checkout),
             **provenance(),
             "rows": rows,
