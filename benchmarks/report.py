@@ -20,6 +20,7 @@ import matplotlib
 import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from benchmarks.page.cells import NOT_RUN, grid, is_wanted, palette, returns_range, title_of
 from benchmarks.page.digits import with_all_digits
@@ -36,7 +37,8 @@ FORMATS = ("png", "pdf", "svg")
 
 def draw(tidy: pd.DataFrame, paths: Sequence[Path], to_run: Collection[str] | None = None) -> None:
     """
-    Draw the figure: tasks across, noises down; the learner's mean with its interval, and the guider's mean in dashes.
+    Draw the figure: tasks across, noises down; each run's learner in a thin line, the mean of the learners with its interval,
+    and the mean of the guiders in dashes.
 
     :param tidy: aggregated evaluations
     :param paths: files of the figure; a suffix names the file's format
@@ -53,6 +55,8 @@ def draw(tidy: pd.DataFrame, paths: Sequence[Path], to_run: Collection[str] | No
                 group = cell[cell.algorithm == algorithm]
                 if group.empty:
                     continue
+                for _, run in group.groupby("seed"):
+                    axis.plot(run.timesteps, run.learner, color=color, linewidth=0.6, alpha=0.5)
                 learner = curves(group)
                 axis.plot(learner.index, learner["mean"], color=color, label=algorithm, linewidth=1.8)
                 axis.fill_between(learner.index, learner.low, learner.high, color=color, alpha=0.15, linewidth=0)
@@ -63,6 +67,7 @@ def draw(tidy: pd.DataFrame, paths: Sequence[Path], to_run: Collection[str] | No
                 axis.set_ylim(returns_range(cell))
             wanted = is_wanted(tidy, task, noise, to_run)
             axis.set(title=title_of(task, noise) if wanted else "", xlabel=steps_label(tidy), ylabel=RETURN)
+            axis.xaxis.set_major_formatter(EngFormatter(sep=""))  # 50k is as wide as its place, 50000 is not
             if cell.empty:
                 axis.set_axis_off()
                 axis.text(0.5, 0.5, NOT_RUN if wanted else "", ha="center", transform=axis.transAxes)
