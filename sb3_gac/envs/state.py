@@ -91,13 +91,13 @@ def restore_env_state(env: gym.Env, states: list[dict[str, Any]]) -> None:
     Put an environment back into a state.
 
     :param env: environment in the same wrappers, changed in place
-    :param states: state of each layer, as :func:`env_state` returns it
+    :param states: state of each layer, as :func:`env_state` returns it; it may be restored again later
     :raises NotRestorableError: if the environment has other layers
     """
     names, expected = [_name(layer) for layer in layers(env)], [state["class"] for state in states]
     if names != expected:
         raise NotRestorableError(f"the environment is made of {names}, but the checkpoint's was made of {expected}")
-    for layer, state in zip(layers(env), states, strict=True):
+    for layer, state in zip(layers(env), deepcopy(states), strict=True):  # the next steps write into arrays and generators
         _restore_layer(layer, {key: value for key, value in state.items() if key != "class"})
 
 

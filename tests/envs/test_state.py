@@ -64,6 +64,18 @@ def test_another_environment_goes_on_to_the_bit(name):
     assert other.episode_returns == env.episode_returns
 
 
+def test_a_state_can_be_restored_again_and_again():
+    env = Monitor(MAKERS["late and lost"]())
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(60)]
+    env.reset(seed=3)
+    state, seen = env_state(env), []
+    for _ in range(2):
+        restore_env_state(env, state)
+        seen.append((_go_on(env, actions), list(env.episode_returns)))
+    np.testing.assert_equal(seen[0], seen[1])
+
+
 @pytest.mark.parametrize("name", MAKERS)
 def test_an_environment_that_was_never_reset_takes_a_state_from_before_the_first_step(name):
     env, other = MAKERS[name](), MAKERS[name]()

@@ -70,6 +70,23 @@ def test_episodes_end_where_the_simulator_or_the_limit_ends_them():
     assert infos[0]["episode"]["l"] == 3, "lengths are counted anew"
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32])
+def test_a_simulator_may_tell_ends_by_numbers(dtype):
+    class Telling(Counters):
+        def advance(self, actions):
+            step = super().advance(actions)
+            return step._replace(terminated=step.terminated.astype(dtype), truncated=np.array([0, 0, 1], dtype))
+
+    env = Telling(3)
+    env.seed(7)
+    env.reset()
+    for _ in range(3):
+        *_, dones, infos = env.step(NO_ACTION)
+    assert dones.dtype == bool
+    assert dones.tolist() == [True, False, True]
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, False, True], "a fall is none of the time limit"
+
+
 def test_noise_is_drawn_once_for_each_observation_and_leaves_the_simulator_alone():
     (clean, first), (noisy, first_noisy) = _started(time_limit=3), _started(time_limit=3, noise_std=0.5)
     assert (first["partial"] != first_noisy["partial"]).all()
@@ -183,6 +200,7 @@ def test_what_it_cannot_do_is_said():
     env.set_options({"goal": 1})
     with pytest.raises(ValueError, match=r"Counters takes no reset options, got .*goal"):
         env.reset()
+    assert env.reset()["privileged"][0, 0] == 0, "the options were of that reset alone"
     with pytest.raises(ValueError, match="vec_env must be of one environment, got 2"):
         SingleEnv(Counters(2))
     with pytest.raises(ValueError, match="must be of a suite whose simulator steps a batch, got 'sb3_gac/Pendulum-v1'"):
@@ -258,6 +276,20 @@ def test_a_checkpoint_goes_on_to_the_bit_where_the_simulator_can_be_put_back(mak
     resumed.learn(20, reset_num_timesteps=False)
     pairs = zip(model.policy.parameters(), resumed.policy.parameters(), strict=True)
     assert all((a == b).all() for a, b in pairs)
+
+
+def test_a_state_can_be_restored_again_and_again():
+    env = RestorableCounters(3, time_limit=4, noise_std=0.1)
+    env.seed(7)
+    env.reset()
+    env.step(NO_ACTION)
+    state, seen = env.checkpoint_state(), []
+    for _ in range(2):
+        env.restore_checkpoint_state(state)
+        steps = [env.step(NO_ACTION) for _ in range(4)]
+        returns = [[info["episode"]["r"] for info in infos if "episode" in info] for *_, infos in steps]
+        seen.append(([observation["partial"].tolist() for observation, *_ in steps], returns))
+    assert seen[0] == seen[1]
 
 
 def test_where_it_cannot_be_a_checkpoint_says_so(tmp_path):

@@ -151,10 +151,11 @@ class BatchVecEnv(VecEnv):
         Begin new episodes in all environments.
 
         :return: first observations of new episodes, seeded if :meth:`seed` was called since the last reset
-        :raises ValueError: if :meth:`set_options` was given options, which this class does not take
+        :raises ValueError: if :meth:`set_options` was given options, which this class does not take; the next reset is without
         """
-        if any(self._options):
-            raise ValueError(f"{type(self).__name__} takes no reset options, got {self._options}: do not call set_options().")
+        if any(options := self._options):
+            self._reset_options()  # or the next reset would be refused as well
+            raise ValueError(f"{type(self).__name__} takes no reset options, got {options}: leave them out.")
         if not self._has_started and self._seeds[0] is None:
             self.seed()
         if self._seeds[0] is None:
@@ -188,6 +189,8 @@ class BatchVecEnv(VecEnv):
         """
         assert self._actions is not None
         raw, rewards, terminated, truncated, values = self.advance(self._actions)
+        # Of the numbers 0 and 1, which a simulator may tell ends by, ~ is true
+        terminated, truncated = np.asarray(terminated, dtype=bool), np.asarray(truncated, dtype=bool)
         self._n_steps += 1
         self._returns += rewards
         if self.time_limit is not None and self._n_steps - self._first_begun >= self.time_limit:
@@ -295,9 +298,10 @@ class BatchVecEnv(VecEnv):
         """
         Put the environments back into a state.
 
-        :param state: state that :meth:`checkpoint_state` returned
+        :param state: state that :meth:`checkpoint_state` returned, which may be restored again later
         :raises NotRestorableError: if the simulator can't be put back
         """
+        state = deepcopy(state)  # the next steps write into arrays and generators
         self.restore_simulator_state(state["simulator"])
         self._begin(np.arange(self.num_envs))
         self._begun -= state["lengths"]

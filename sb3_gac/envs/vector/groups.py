@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 from sb3_gac.envs.selections import KeySelection
@@ -60,7 +61,7 @@ class GroupsVecEnv(BatchVecEnv):
             noise_std=noise_std,
         )
         self.extras: Mapping[str, Any] = {}
-        self._like: Any = None
+        self._device: Any = None
         self._shown: Groups = {}
         self._has_ended = np.zeros(self.num_envs, dtype=bool)
 
@@ -92,7 +93,9 @@ class GroupsVecEnv(BatchVecEnv):
         :return: results of the step, with the last observations of episodes that have ended
         """
         before = self._shown
-        given = actions if self._like is None else self._like.new_tensor(actions)
+        given = np.asarray(actions, dtype=self.action_space.dtype)
+        if self._device is not None:
+            given = th.tensor(given, device=self._device)
         groups, rewards, terminated, truncated, self.extras = self.simulator.step(given)
         self._shown = _in_arrays(groups)
         terminated, truncated = (_array(flags).astype(bool) for flags in (terminated, truncated))
@@ -111,7 +114,7 @@ class GroupsVecEnv(BatchVecEnv):
     def _reset(self, **given: Any) -> Groups:
         groups, self.extras = self.simulator.reset(**given)
         first = next(iter(groups.values()))
-        self._like = first if hasattr(first, "new_tensor") else None  # actions go to the device of the observations
+        self._device = first.device if isinstance(first, th.Tensor) else None  # actions go to the device of the observations
         self._shown, self._has_ended = _in_arrays(groups), np.zeros(self.num_envs, dtype=bool)
         return self._shown
 
