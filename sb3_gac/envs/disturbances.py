@@ -73,9 +73,13 @@ class DroppedFrames(EntryWrapper):
         if not is_number or not 0 <= probability <= 1:
             raise ValueError(f"probability must be a number from 0 to 1, with which a value is lost, got {probability!r}.")
         self.probability = float(probability)
-        self._stream = [FRAME_STREAM] * (1 + count_wrappers(env, DroppedFrames))  # separate from losses of inner wrappers
         self._generator = np.random.default_rng()
         self._shown = np.empty(0)
+
+    @property
+    def _stream(self) -> list[int]:
+        """Name of the losses' random numbers, separate from those of inner wrappers, which :func:`disturb` may add later."""
+        return [FRAME_STREAM] * (1 + count_wrappers(self.env, DroppedFrames))
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         if seed is not None:
@@ -115,8 +119,9 @@ def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 
     Disturb the sensor of an environment that has wrappers already.
 
     The new wrappers stand directly around the sensor's signal, beneath every history, previous action and goal: these are the
-    policy's own and need no sensor. The function is for evaluations: the outer wrappers keep the bounds of their spaces,
-    although noisy values may go beyond them.
+    policy's own and need no sensor. New noise stands beneath the environment's own delays and losses as well: a value that is
+    late or shown again keeps the noise of its measurement. The function is for evaluations: the outer wrappers keep the bounds
+    of their spaces, although noisy values may go beyond them.
 
     :param env: environment in its wrappers, changed in place, which must not have been reset yet
     :param noise_std: standard deviation of noise on top of the environment's own, 0 for none
@@ -127,11 +132,9 @@ def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 
     :raises ValueError: if an argument is wrong; the message names it
     """
 
-    def wrap(inner: gym.Env) -> gym.Env:
-        noisy = inner if noise_std == 0 else SensorNoise(inner, noise_std, key)
-        return delayed_and_dropped(noisy, delay, drop, key)
-
-    return insert_above(env, sensor_layer(env), wrap)
+    if noise_std != 0:
+        env = insert_above(env, _measured_layer(env, key), lambda inner: SensorNoise(inner, noise_std, key))
+    return insert_above(env, sensor_layer(env), lambda inner: delayed_and_dropped(inner, delay, drop, key))
 
 
 def sensor_layer(env: gym.Env) -> gym.Env:
@@ -143,6 +146,13 @@ def sensor_layer(env: gym.Env) -> gym.Env:
     """
     outside = [number for number, layer in enumerate(layers(env)) if isinstance(layer, _AFTER_THE_SENSOR)]
     return layers(env)[outside[-1] + 1 if outside else 0]
+
+
+def _measured_layer(env: gym.Env, key: str) -> gym.Env:
+    """Outermost layer of the sensor beneath all delays and losses of the entry, which come after the measurement."""
+    signal = sensor_layer(env)
+    sending = [layer for layer in layers(signal) if isinstance(layer, (SensorDelay, DroppedFrames)) and layer.key == key]
+    return sending[-1].env if sending else signal
 
 
 def insert_above(env: gym.Env, layer: gym.Env, wrap: Callable[[gym.Env], gym.Env]) -> gym.Env:

@@ -122,12 +122,12 @@ class EntryWrapper(gym.Wrapper, ABC):
 
     def __init__(self, env: gym.Env, key: str):
         super().__init__(env)
-        self._key = key
+        self.key = key
         self._entry = box_entry(env.observation_space, key)
 
     def _set_entry_space(self, box: spaces.Box) -> None:
         entries = self.env.observation_space.spaces  # type: ignore[attr-defined]
-        self.observation_space = spaces.Dict({**entries, self._key: box})
+        self.observation_space = spaces.Dict({**entries, self.key: box})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """
@@ -136,7 +136,7 @@ class EntryWrapper(gym.Wrapper, ABC):
         :return: changed observation, info
         """
         observation, info = reset_with(self.env, seed, options)
-        return {**observation, self._key: self._first(observation[self._key], seed)}, info
+        return {**observation, self.key: self._first(observation[self.key], seed)}, info
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
         """
@@ -144,7 +144,7 @@ class EntryWrapper(gym.Wrapper, ABC):
         :return: changed observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        changed = {**observation, self._key: self._next(observation[self._key], action, reward)}
+        changed = {**observation, self.key: self._next(observation[self.key], action, reward)}
         return changed, reward, terminated, truncated, info
 
     @abstractmethod
@@ -173,10 +173,14 @@ class SensorNoise(EntryWrapper):
         super().__init__(env, key)
         self.noise_std = check_noise_std(noise_std, self._entry, key)
         self._set_entry_space(noisy_box(self._entry, self.noise_std))
-        self._stream = [NOISE_STREAM] * (1 + count_wrappers(env, SensorNoise))  # separate from noise of inner wrappers
         self._generator = np.random.default_rng()
         self._drawn = np.empty((0, *self._entry.shape), dtype=self._entry.dtype)
         self._n_used = 0
+
+    @property
+    def _stream(self) -> list[int]:
+        """Name of the noise's random numbers, separate from those of inner wrappers, which an evaluation may add later."""
+        return [NOISE_STREAM] * (1 + count_wrappers(self.env, SensorNoise))
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         if seed is not None:

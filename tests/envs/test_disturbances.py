@@ -12,7 +12,7 @@ from sb3_gac.envs import DroppedFrames, History, PreviousAction, SensorDelay, Se
 from sb3_gac.envs.disturbances import disturb, sensor_layer
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.state import env_state, layers, restore_env_state
-from tests.envs.test_wrappers import IMAGE, PAIR, Reusing, Strict
+from tests.envs.test_wrappers import IMAGE, PAIR, Reusing, Still, Strict
 
 ACTION = np.zeros(1, dtype=np.float32)
 
@@ -221,6 +221,28 @@ def test_an_environment_with_wrappers_of_its_own_is_disturbed_beneath_its_memory
     ]
     env.reset(seed=0)
     assert env.step(ACTION)[0]["partial"].shape == (3 * 2 + 2 + 1,)
+
+
+def test_added_noise_is_that_of_the_measurement_where_the_environment_has_delays_and_losses_of_its_own():
+    env = History(DroppedFrames(SensorDelay(DroppedFrames(Still(PAIR), 0.0, key="privileged"), 1), 1.0), 2)
+    disturb(env, noise_std=0.5, drop=0.2)
+    kinds = [History, DroppedFrames, DroppedFrames, SensorDelay, SensorNoise, DroppedFrames, Still]
+    assert [type(layer) for layer in layers(env)] == kinds
+    shown = [env.reset(seed=0)[0]["partial"], *(env.step(ACTION)[0]["partial"] for _ in range(9))]
+    assert np.abs(shown[0] - [0, 1, 0, 1]).max() > 1e-3
+    np.testing.assert_array_equal(shown, [shown[0]] * 10, "a value that is shown again has the same noise")
+
+
+def test_added_noise_and_losses_are_independent_of_those_further_out():
+    space = spaces.Dict(partial=spaces.Box(-9, 9, (2,)), privileged=spaces.Box(-9, 9, (2,)))
+    env = disturb(SensorNoise(History(Still(space), 1), 0.5, key="privileged"), noise_std=0.5)
+    env.reset(seed=0)
+    noise = np.stack([np.stack(list(env.step(ACTION)[0].values())) for _ in range(400)]) - [0, 1]
+    assert abs(np.corrcoef(noise[:, 0, 0], noise[:, 1, 0])[0, 1]) < 4 / np.sqrt(400)
+    counting = disturb(DroppedFrames(History(Counting(), 1), 0.5, key="privileged"), drop=0.5)
+    seen = [counting.reset(seed=0)[0], *(counting.step(ACTION)[0] for _ in range(400))]
+    lost = [np.diff([values[key][0] for values in seen]) == 0 for key in ("partial", "privileged")]
+    assert abs(np.corrcoef(*lost)[0, 1]) < 4 / np.sqrt(400)
 
 
 def test_a_goal_is_no_measurement():
