@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.wrappers import EntryWrapper
 
@@ -33,7 +34,7 @@ class CameraImage(EntryWrapper):
     :param size: height and width of the image, in pixels
     :param camera: name of the camera in MuJoCo's model
     :param key: key of the entry that the image replaces
-    :raises ValueError: if the environment has no such camera, or ``size`` is not positive
+    :raises ValueError: if the environment has no such camera, or ``size`` is no positive integer
     """
 
     def __init__(self, env: gym.Env, size: int = 64, camera: str = "track", key: str = PARTIAL):
@@ -44,11 +45,9 @@ class CameraImage(EntryWrapper):
         cameras = [model.camera(number).name for number in range(model.ncam)]
         if camera not in cameras:
             raise ValueError(f"camera must be one of {cameras}, got {camera!r}.")
-        if size < 1:
-            raise ValueError(f"size must be at least 1 pixel, got {size}.")
-        self._size, self._camera = size, camera
+        self._size, self._camera = check_count("size", size, of_what="in pixels"), camera
         self._renderer: Any = None
-        self._set_entry_space(spaces.Box(0, 255, (3, size, size), np.uint8))
+        self._set_entry_space(spaces.Box(0, 255, (3, self._size, self._size), np.uint8))
 
     def close(self) -> None:
         """Close the camera's renderer and the environment."""

@@ -15,6 +15,7 @@ from collections.abc import Callable
 import gymnasium as gym
 import numpy as np
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
@@ -39,9 +40,7 @@ class SensorDelay(EntryWrapper):
 
     def __init__(self, env: gym.Env, steps: int, key: str = PARTIAL):
         super().__init__(env, key)
-        if not isinstance(steps, (int, np.integer)) or isinstance(steps, bool) or steps < 0:
-            raise ValueError(f"steps must be an integer of at least 0, by which the entry is late, got {steps!r}.")
-        self.steps = int(steps)
+        self.steps = check_count("steps", steps, 0, "by which the entry is late")
         self._values: deque[np.ndarray] = deque(maxlen=self.steps + 1)
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:

@@ -9,13 +9,14 @@ Each is a picklable ``gymnasium.Wrapper``, and passes the environment checkers o
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
 from sb3_gac.envs.selections import KeySelection, as_slice, check_indices, check_keys
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, take_from_box
@@ -210,13 +211,12 @@ class History(EntryWrapper):
     :param actions: whether to append the ``length - 1`` actions between the values; needs Box actions and a one-dimensional
         entry of floats
     :param key: the entry that gets a history
-    :raises ValueError: if ``length`` is not positive, or the entry or the actions are of another kind
+    :raises ValueError: if ``length`` is no positive integer, or the entry or the actions are of another kind
     """
 
     def __init__(self, env: gym.Env, length: int, actions: bool = False, key: str = PARTIAL):
         super().__init__(env, key)
-        if length < 1:
-            raise ValueError(f"length must be at least 1, got {length}.")
+        length = check_count("length", length)
         if not self._entry.shape:
             raise ValueError(f'History needs an entry with at least one axis, but "{key}" has {self._entry}.')
         is_vector = len(self._entry.shape) == 1 and np.issubdtype(self._entry.dtype, np.floating)
@@ -308,7 +308,7 @@ def count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
 
 
 def _check_kept(keep: Sequence[str]) -> Sequence[str]:
-    if isinstance(keep, str) or {PARTIAL, PRIVILEGED} & set(keep):
+    if not isinstance(keep, Collection) or isinstance(keep, str) or {PARTIAL, PRIVILEGED} & set(keep):
         raise ValueError(f"keep must be a list of keys, other than {PARTIAL!r} and {PRIVILEGED!r}, got {keep!r}.")
     return keep
 

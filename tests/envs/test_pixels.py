@@ -170,8 +170,10 @@ def test_where_mujoco_itself_fails_for_want_of_opengl(monkeypatch):
         ({"task": "Pusher"}, "task must be one of .*HalfCheetah"),
         ({"noise_std": 0.1}, "noise_std must be 0 for images, got 0.1"),
         ({"camera": "front"}, r"camera must be one of \['track'\], got 'front'"),
-        ({"size": 0}, "size must be at least 1"),
-        ({"frames": 0}, "length must be at least 1"),
+        ({"size": 0}, "size must be an integer of at least 1"),
+        ({"size": 64.5}, "size must be an integer of at least 1, in pixels, got 64.5"),
+        ({"frames": 0}, "frames must be an integer of at least 1, got 0"),
+        ({"frames": 2.5}, "frames must be an integer of at least 1, got 2.5"),
         ({"privileged": "everything"}, "privileged must be one of"),
     ],
 )

@@ -180,6 +180,7 @@ def test_a_monitor_around_it_counts_the_same():
     ("wrong", "message"),
     [
         ({"n_envs": 0}, "n_envs must be"),
+        ({"n_envs": True}, "n_envs must be"),
         ({"time_limit": 2.5}, "time_limit must be"),
         ({"noise_std": -1.0}, "noise_std must be"),
         ({"noise_std": [1.0] * 5}, "noise_std must be a number or have the entry's shape"),
@@ -215,6 +216,10 @@ def test_an_id_makes_the_suites_own_and_one_of_them():
     assert (env.num_envs, env.time_limit, float(env.noise_std)) == (2, 5, 0.5)
     assert (env.reset()["privileged"] == _started(n_envs=2)[1]["privileged"]).all()
     assert make_vec("sb3_gac/Counters-v0", time_limit=2).time_limit == 2
+    assert make_vec("sb3_gac/Counters-v0", history=1, delay=0, drop=0.0).num_envs == 1, "none of them is asked for"
+    for make in (make_vec, gym.make):
+        with pytest.raises(ValueError, match=r"history is for environments that are stepped one at a time.*Counters"):
+            make("sb3_gac/Counters-v0", history=4)
     single = gym.make("sb3_gac/Counters-v0", noise_std=0.1)
     check_env(single.unwrapped, skip_render_check=True)
     sb3_check_env(single.unwrapped, warn=False)
@@ -227,6 +232,12 @@ def test_other_ids_are_made_by_sb3():
     assert env.get_attr("noise_std")[0] == 0.5
     expected = gym.make("sb3_gac/Pendulum-v1").reset(seed=3)[0]["privileged"]
     assert (env.reset()["privileged"][0] == expected).all()
+
+
+@pytest.mark.parametrize("n_envs", [0, -1, 2.5, "2", None])
+def test_a_number_of_environments_that_is_none_is_named(n_envs):
+    with pytest.raises(ValueError, match="n_envs must be an integer of at least 1, got"):
+        make_vec("sb3_gac/Pendulum-v1", n_envs)
 
 
 def test_one_environment_ends_and_begins_as_gymnasium_has_it():

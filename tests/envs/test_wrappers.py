@@ -442,6 +442,13 @@ REFUSED = {
     "noise, integers": (INTEGERS, lambda env: SensorNoise(env, 0.1), 'floating-point entry, but "partial"'),
     "noise, no box": (NO_BOX, lambda env: SensorNoise(env, 0.1), '"partial" must be a Box'),
     "noise, no dict": (FLAT, lambda env: SensorNoise(env, 0.1), 'no entry "partial"'),
+    "noise, a word": (PAIR, lambda env: SensorNoise(env, "much"), "noise_std must be .*'much'"),
+    "noise, a mapping": (PAIR, lambda env: SensorNoise(env, {"partial": 0.1}), "noise_std must be"),
+    "noise, uneven lists": (PAIR, lambda env: SensorNoise(env, [[0.1], [0.1, 0.2]]), "noise_std must be"),
+    "split, a number": (FLAT, lambda env: SplitObservation(env, 3, [0]), "partial must be .* got 3"),
+    "split, none": (FLAT, lambda env: SplitObservation(env, [0], None), "privileged must be .* got None"),
+    "split, uneven lists": (FLAT, lambda env: SplitObservation(env, [[0], [0, 1]], [0]), "partial must be"),
+    "split, used up": (FLAT, lambda env: SplitObservation(env, (i for i in (0, 9)), [0]), r"partial must be .*\[0, 9\]"),
     "split, empty": (FLAT, lambda env: SplitObservation(env, [], [0]), "partial must be"),
     "split, negative index": (FLAT, lambda env: SplitObservation(env, [0], [-1]), "privileged must be .* 0..5"),
     "split, index too large": (FLAT, lambda env: SplitObservation(env, [0, 6], [0]), "partial must be .* 0..5"),
@@ -455,6 +462,13 @@ REFUSED = {
     "split dict, unknown": (GOAL, lambda env: SplitDictObservation(env, ["joints"], ["observation"]), '"joints"'),
     "split dict, empty": (GOAL, lambda env: SplitDictObservation(env, ["observation"], []), "privileged must be"),
     "split dict, string": (GOAL, lambda env: SplitDictObservation(env, "observation", ["observation"]), "partial must be"),
+    "split dict, a number": (GOAL, lambda env: SplitDictObservation(env, 3, ["observation"]), "partial must be .* got 3"),
+    "split dict, a set": (GOAL, lambda env: SplitDictObservation(env, {"observation"}, ["observation"]), "partial must be"),
+    "split dict, an index": (
+        GOAL,
+        lambda env: SplitDictObservation(env, ["observation"], {"observation": 0}),
+        r'privileged\["observation"\] must be .* got 0',
+    ),
     "split dict, no box": (NO_BOX, lambda env: SplitDictObservation(env, ["partial"], ["privileged"]), '"partial" must be'),
     "split dict, bad index": (
         GOAL,
@@ -463,6 +477,9 @@ REFUSED = {
     ),
     "history, length 0": (PAIR, lambda env: History(env, 0), "length"),
     "history, length -1": (PAIR, lambda env: History(env, -1), "length"),
+    "history, length 2.5": (PAIR, lambda env: History(env, 2.5), "length must be an integer .* got 2.5"),
+    "history, length '2'": (PAIR, lambda env: History(env, "2"), "length must be an integer .* got '2'"),
+    "history, length True": (PAIR, lambda env: History(env, True), "length must be an integer .* got True"),
     "history, unknown key": (PAIR, lambda env: History(env, 2, key="joints"), '"joints"'),
     "history, no box": (NO_BOX, lambda env: History(env, 2), '"partial" must be a Box'),
     "history, scalar": (SCALAR, lambda env: History(env, 2), "at least one axis"),
@@ -475,6 +492,11 @@ REFUSED = {
 def test_refuses_with_the_culprit_named(space, wrap, message):
     with pytest.raises(ValueError, match=message):
         wrap(Strict(space))
+
+
+def test_keys_and_lengths_of_numpys_types_are_taken():
+    env = SplitDictObservation(Strict(GOAL), np.array(["observation", "desired_goal"]), np.array(["achieved_goal"]))
+    assert History(env, np.int64(2)).observation_space["partial"].shape == (2 * (6 + 2),)
 
 
 def test_history_refuses_to_append_discrete_actions():

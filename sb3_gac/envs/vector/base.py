@@ -13,6 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
 from sb3_gac.envs.selections import BatchSelection, Indices, KeySelection
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
@@ -76,15 +77,14 @@ class BatchVecEnv(VecEnv):
         time_limit: int | None = None,
         noise_std: float | Sequence[float] = 0.0,
     ):
-        for name, value in {"n_envs": n_envs, "time_limit": 1 if time_limit is None else time_limit}.items():
-            if not isinstance(value, (int, np.integer)) or value < 1:
-                raise ValueError(f"{name} must be a whole number above 0, got {value!r}.")
+        n_envs = check_count("n_envs", n_envs)
+        time_limit = None if time_limit is None else check_count("time_limit", time_limit)
         self._partial = BatchSelection(PARTIAL, partial, observation_space)
         self._privileged = BatchSelection(PRIVILEGED, privileged, observation_space)
         self.time_limit, self.noise_std = time_limit, check_noise_std(noise_std, self._partial.space, PARTIAL)
         noisy = noisy_box(self._partial.space, self.noise_std)
         space = spaces.Dict({PARTIAL: noisy, PRIVILEGED: self._privileged.space})
-        super().__init__(int(n_envs), space, _in_float32(action_space))
+        super().__init__(n_envs, space, _in_float32(action_space))
         actions = self.action_space
         self._bounds = (actions.low, actions.high) if isinstance(actions, spaces.Box) else None
         self._is_noisy, self._noise = bool((self.noise_std > 0).any()), np.random.default_rng()

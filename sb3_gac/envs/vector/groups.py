@@ -93,7 +93,7 @@ class GroupsVecEnv(BatchVecEnv):
         :return: results of the step, with the last observations of episodes that have ended
         """
         before = self._shown
-        given = np.asarray(actions, dtype=self.action_space.dtype)
+        given: Any = np.asarray(actions, dtype=self.action_space.dtype)
         if self._device is not None:
             given = th.tensor(given, device=self._device)
         groups, rewards, terminated, truncated, self.extras = self.simulator.step(given)
