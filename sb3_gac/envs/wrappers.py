@@ -19,7 +19,7 @@ from gymnasium import spaces
 from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
 from sb3_gac.envs.selections import KeySelection, as_slice, check_indices, check_keys
-from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, take_from_box
+from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, has_channels_last, take_from_box
 
 Observation = dict[str, np.ndarray]
 _NOISE_BLOCK = 128  # samples of the noise that are drawn at once: one by one takes several times as long
@@ -204,6 +204,7 @@ class History(EntryWrapper):
     """
     Replace one entry by its last ``length`` values, oldest first, joined along the first axis.
 
+    Images with their channels last are joined along that axis, so that the history is an image of more channels.
     After a reset the first value fills the whole history, and past actions are zero.
 
     :param env: environment with a Dict observation
@@ -233,7 +234,8 @@ class History(EntryWrapper):
         if actions:
             # A policy may hand in actions outside the space, which many environments clip
             boxes += [spaces.Box(-np.inf, np.inf, (n_actions,), np.float32)] * (length - 1)
-        self._set_entry_space(concatenate_boxes(boxes))
+        self._axis = 2 if has_channels_last(self._entry) else 0
+        self._set_entry_space(concatenate_boxes(boxes, self._axis))
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         self._values.extend([value.copy()] * (self._values.maxlen or 0))
@@ -248,7 +250,7 @@ class History(EntryWrapper):
 
     def _joined(self) -> np.ndarray:
         parts = [*self._values, *self._actions] if self._no_action.size else list(self._values)
-        return np.concatenate(parts, dtype=self._entry.dtype)
+        return np.concatenate(parts, self._axis, dtype=self._entry.dtype)
 
 
 class PreviousAction(EntryWrapper):

@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecTransposeImage
 
 from sb3_gac.envs import (
     DroppedFrames,
@@ -379,6 +380,18 @@ def test_history_of_images_joins_them_along_the_first_axis():
     image = env.step(NO_ACTION)[0]["partial"]
     assert image.dtype == np.uint8
     assert image.tolist() == [[[0, 1]], [[2, 3]], [[10, 11]], [[12, 13]], [[20, 21]], [[22, 23]]]
+
+
+def test_history_of_images_with_channels_last_is_what_sb3_stacks():
+    space = spaces.Dict(partial=_box(5, 4, 3, dtype=np.uint8))
+    ours = VecTransposeImage(DummyVecEnv([lambda: History(Strict(space), 2)]))
+    stacked = VecTransposeImage(VecFrameStack(DummyVecEnv([lambda: Strict(space)]), 2))
+    assert ours.observation_space == stacked.observation_space == spaces.Dict(partial=_box(6, 5, 4, dtype=np.uint8))
+    ours.reset()
+    stacked.reset()
+    for _ in range(3):
+        seen, expected = (env.step(NO_ACTION[None])[0]["partial"] for env in (ours, stacked))
+        np.testing.assert_array_equal(seen, expected)
 
 
 def test_history_of_the_privileged_entry_leaves_partial_alone():
