@@ -52,19 +52,23 @@ class CameraImage(EntryWrapper):
             raise ValueError(f"camera must be one of {cameras}, got {camera!r}.")
         self._size, self._camera = check_count("size", size, of_what="in pixels"), camera
         self._renderer: Any = None
+        self._model: Any = None
         self._looks: list[tuple[np.ndarray, np.ndarray]] = []
         self._set_entry_space(spaces.Box(0, 255, (3, self._size, self._size), np.uint8))
 
     def close(self) -> None:
         """Close the camera's renderer and the environment."""
+        self._close_renderer()
+        super().close()
+
+    def _close_renderer(self) -> None:
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-        super().close()
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the renderer out: a copy, such as one in another process, makes its own."""
-        return {**vars(self), "_renderer": None, "_looks": []}
+        return {**vars(self), "_renderer": None, "_model": None, "_looks": []}
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         return self._image()
@@ -74,7 +78,9 @@ class CameraImage(EntryWrapper):
 
     def _image(self) -> np.ndarray:
         simulator: Any = self.env.unwrapped
-        if self._renderer is None:
+        if self._renderer is None or simulator.model is not self._model:  # a reset may make another robot
+            self._close_renderer()
+            self._model = simulator.model
             self._renderer = make_renderer(simulator.model, self._size)
             copied = arrays_of(self._renderer.model, LOOKS)
             looks = arrays_of(simulator.model, LOOKS)

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from sb3_gac.envs import CameraImage, NoRenderingError, SplitObservation, make_pixels
 from sb3_gac.envs.camera import make_renderer
-from sb3_gac.envs.state import env_state, restore_env_state
+from sb3_gac.envs.state import env_state, layers, restore_env_state
 from sb3_gac.envs.suites.pixels import TASKS
 from tests.envs.rendering import needs_rendering
 
@@ -90,6 +90,17 @@ def test_an_image_shows_what_the_environment_has_changed_in_its_model():
         getattr(model, name)[:] = before
         np.testing.assert_array_equal(env.reset(seed=0)[0]["partial"], plain)
     env.close()
+
+
+@pytest.mark.usefixtures("_rendering")
+def test_an_image_shows_another_robot_once_the_environment_has_it():
+    env, walker = _make("Hopper", frames=1), _make("Walker2d", frames=1)
+    env.reset(seed=0)
+    expected = walker.reset(seed=0)[0]["partial"]
+    env.unwrapped.model, env.unwrapped.data = walker.unwrapped.model, walker.unwrapped.data
+    camera = next(layer for layer in layers(env) if isinstance(layer, CameraImage))
+    np.testing.assert_array_equal(camera._image(), expected)
+    walker.close()
 
 
 @pytest.mark.usefixtures("_rendering")
