@@ -23,7 +23,7 @@ def box_entry(space: spaces.Space, key: str) -> spaces.Box:
         raise ValueError(f'The observation has no entry "{key}"; its space is {space}.')
     entry = space[key]
     if not isinstance(entry, spaces.Box):
-        raise ValueError(f'The entry "{key}" must be a Box, but is {entry}.')
+        raise ValueError(f'The entry "{key}" must be a Box, but is {entry}: make it one in the environment.')
     return entry
 
 

@@ -22,7 +22,8 @@ from sb3_gac.envs.selections import KeySelection, as_slice, check_indices, check
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, has_channels_last, take_from_box
 
 Observation = dict[str, np.ndarray]
-_NOISE_BLOCK = 128  # samples of the noise that are drawn at once: one by one takes several times as long
+#: Samples of the noise that are drawn at once, since one by one takes several times as long; and numbers, for large entries
+_NOISE_BLOCK, _NOISE_NUMBERS = 128, 2**16
 
 
 def reset_with(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
@@ -175,6 +176,7 @@ class SensorNoise(EntryWrapper):
         self.noise_std = check_noise_std(noise_std, self._entry, key)
         self._set_entry_space(noisy_box(self._entry, self.noise_std))
         self._generator = np.random.default_rng()
+        self._block = max(1, min(_NOISE_BLOCK, _NOISE_NUMBERS // max(1, self._entry.low.size)))
         self._drawn = np.empty((0, *self._entry.shape), dtype=self._entry.dtype)
         self._n_used = 0
 
@@ -194,7 +196,7 @@ class SensorNoise(EntryWrapper):
 
     def _noisy(self, value: np.ndarray) -> np.ndarray:
         if self._n_used == len(self._drawn):
-            noise = self._generator.standard_normal((_NOISE_BLOCK, *self._entry.shape), dtype=np.float32) * self.noise_std
+            noise = self._generator.standard_normal((self._block, *self._entry.shape), dtype=np.float32) * self.noise_std
             self._drawn, self._n_used = noise.astype(self._entry.dtype), 0
         self._n_used += 1
         return value + self._drawn[self._n_used - 1]

@@ -100,7 +100,7 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         self._episodes = EpisodeIndex()
         for episode in state["episodes"].tolist():
             self._episodes.append(*episode)
-        self._episode_starts = state["starts"]
+        self._episode_starts = state["starts"].copy()
 
     def add(  # type: ignore[override]
         self,

@@ -305,6 +305,17 @@ def test_noise_repeats_with_its_seed_and_differs_between_seeds():
     assert np.array_equal(_noise(env, 4, seed=1), _noise(env, 4, seed=1))  # also where it had been used before
 
 
+def test_noise_of_a_large_entry_takes_little_memory():
+    image = spaces.Dict(partial=_box(3, 84, 84))
+    env = SensorNoise(Strict(image), 0.1)
+    clean, drawn = Strict(image), np.random.default_rng([0, 0x6E6F697365])
+    for seed in (0, None, None, None, None):
+        noise = drawn.standard_normal((3, 84, 84), dtype=np.float32) * np.float32(0.1)
+        given = {} if seed is None else {"seed": seed}
+        np.testing.assert_array_equal(env.reset(**given)[0]["partial"], clean.reset(**given)[0]["partial"] + noise)
+    assert len(pickle.dumps(env)) < 2e6
+
+
 def test_noise_goes_on_after_a_reset_without_a_seed():
     env = SensorNoise(Still(PAIR), 0.1)
     first = env.reset(seed=0)[0]["partial"]
