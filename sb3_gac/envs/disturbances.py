@@ -150,7 +150,7 @@ def sensor_layer(env: gym.Env) -> gym.Env:
 def _measured_layer(env: gym.Env, key: str) -> gym.Env:
     """Outermost layer of the sensor beneath all delays and losses of the entry, which come after the measurement."""
     signal = sensor_layer(env)
-    sending = [layer for layer in layers(signal) if isinstance(layer, (SensorDelay, DroppedFrames)) and layer.key == key]
+    sending = [layer for layer in layers(signal) if isinstance(layer, (SensorDelay, DroppedFrames)) and layer._key == key]
     return sending[-1].env if sending else signal
 
 

@@ -124,12 +124,12 @@ class EntryWrapper(gym.Wrapper, ABC):
 
     def __init__(self, env: gym.Env, key: str):
         super().__init__(env)
-        self.key = key
+        self._key = key
         self._entry = box_entry(env.observation_space, key)
 
     def _set_entry_space(self, box: spaces.Box) -> None:
         entries = self.env.observation_space.spaces  # type: ignore[attr-defined]
-        self.observation_space = spaces.Dict({**entries, self.key: box})
+        self.observation_space = spaces.Dict({**entries, self._key: box})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """
@@ -138,7 +138,7 @@ class EntryWrapper(gym.Wrapper, ABC):
         :return: changed observation, info
         """
         observation, info = reset_with(self.env, seed, options)
-        return {**observation, self.key: self._first(observation[self.key], seed)}, info
+        return {**observation, self._key: self._first(observation[self._key], seed)}, info
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
         """
@@ -146,7 +146,7 @@ class EntryWrapper(gym.Wrapper, ABC):
         :return: changed observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        changed = {**observation, self.key: self._next(observation[self.key], action, reward)}
+        changed = {**observation, self._key: self._next(observation[self._key], action, reward)}
         return changed, reward, terminated, truncated, info
 
     @abstractmethod
