@@ -40,8 +40,22 @@ class SensorDelay(EntryWrapper):
 
     def __init__(self, env: gym.Env, steps: int, key: str = PARTIAL):
         super().__init__(env, key)
-        self.steps = check_count("steps", steps, 0, "by which the entry is late")
+        self._steps = self._checked(steps)
         self._values: deque[np.ndarray] = deque(maxlen=self.steps + 1)
+
+    @staticmethod
+    def _checked(steps: int) -> int:
+        return check_count("steps", steps, 0, "by which the entry is late")
+
+    @property
+    def steps(self) -> int:
+        """Number of steps by which the entry is late; a larger one takes effect as further values are measured."""
+        return self._steps
+
+    @steps.setter
+    def steps(self, steps: int) -> None:
+        self._steps = self._checked(steps)
+        self._values = deque(self._values, self._steps + 1)
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         self._values.extend([value.copy()] * (self.steps + 1))

@@ -173,12 +173,20 @@ class SensorNoise(EntryWrapper):
 
     def __init__(self, env: gym.Env, noise_std: float | Sequence[float], key: str = PARTIAL):
         super().__init__(env, key)
-        self.noise_std = check_noise_std(noise_std, self._entry, key)
-        self._set_entry_space(noisy_box(self._entry, self.noise_std))
         self._generator = np.random.default_rng()
         self._block = max(1, min(_NOISE_BLOCK, _NOISE_NUMBERS // max(1, self._entry.low.size)))
-        self._drawn = np.empty((0, *self._entry.shape), dtype=self._entry.dtype)
-        self._n_used = 0
+        self.noise_std = noise_std
+        self._set_entry_space(noisy_box(self._entry, self.noise_std))
+
+    @property
+    def noise_std(self) -> np.ndarray:
+        """Standard deviation of the noise from the next step on; the bounds of the space are those of the first one."""
+        return self._noise_std
+
+    @noise_std.setter
+    def noise_std(self, noise_std: float | Sequence[float]) -> None:
+        self._noise_std = check_noise_std(noise_std, self._entry, self._key)
+        self._drawn, self._n_used = np.empty((0, *self._entry.shape), dtype=self._entry.dtype), 0
 
     @property
     def _stream(self) -> list[int]:

@@ -79,6 +79,18 @@ def test_a_delayed_image_is_the_image_before():
         before = env.unwrapped.latest["partial"].copy()
 
 
+def test_another_delay_counts_from_the_next_step_on():
+    env = SensorDelay(Counting(), 1)
+    assert _seen(env, 4)[:, 0].tolist() == [0, 0, 1, 2, 3]
+    env.steps = 3
+    assert [env.step(ACTION)[0]["partial"][0] for _ in range(4)] == [3, 3, 4, 5]
+    env.steps = 0
+    assert env.step(ACTION)[0]["partial"][0] == 9
+    assert _seen(env, 2)[:, 0].tolist() == [0, 1, 2]
+    with pytest.raises(ValueError, match="steps must be an integer of at least 0"):
+        env.steps = -1
+
+
 @pytest.mark.parametrize("steps", [-1, 1.0, True, "2", None])
 def test_a_delay_that_is_none_is_refused(steps):
     with pytest.raises(ValueError, match=r"steps must be an integer of at least 0.*got "):

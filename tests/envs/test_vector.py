@@ -103,6 +103,17 @@ def test_noise_is_drawn_once_for_each_observation_and_leaves_the_simulator_alone
             assert (noise_of_last != noise_of_next).all()
 
 
+def test_another_noise_std_counts_from_the_next_step_on():
+    env, first = _started(partial=["steps"])
+    assert not first["partial"].any()
+    env.set_attr("noise_std", 0.5)
+    assert (env.step(NO_ACTION)[0]["partial"] != 1).all()
+    env.set_attr("noise_std", 0.0)
+    assert (env.step(NO_ACTION)[0]["partial"] == 2).all()
+    with pytest.raises(ValueError, match="noise_std must be a finite number >= 0"):
+        env.set_attr("noise_std", -1.0)
+
+
 def test_noise_is_gaussian_of_the_given_size_and_independent():
     env, first = _started(n_envs=2_000, noise_std=[0.5, 0.0])
     assert not np.isfinite(env.observation_space["partial"].high[0])

@@ -316,6 +316,18 @@ def test_noise_of_a_large_entry_takes_little_memory():
     assert len(pickle.dumps(env)) < 2e6
 
 
+def test_another_noise_std_counts_from_the_next_step_on():
+    env = gym.wrappers.TimeLimit(SensorNoise(Still(PAIR), 0.5), 10)
+    env.reset(seed=0)
+    assert env.step(NO_ACTION)[0]["partial"][0] != 0
+    env.set_wrapper_attr("noise_std", [0.0, 0.5])
+    seen = env.step(NO_ACTION)[0]["partial"]
+    assert seen[0] == 0
+    assert seen[1] != 1
+    with pytest.raises(ValueError, match="noise_std must be a finite number >= 0"):
+        env.set_wrapper_attr("noise_std", -1.0)
+
+
 def test_noise_goes_on_after_a_reset_without_a_seed():
     env = SensorNoise(Still(PAIR), 0.1)
     first = env.reset(seed=0)[0]["partial"]

@@ -81,19 +81,29 @@ class BatchVecEnv(VecEnv):
         time_limit = None if time_limit is None else check_count("time_limit", time_limit)
         self._partial = BatchSelection(PARTIAL, partial, observation_space)
         self._privileged = BatchSelection(PRIVILEGED, privileged, observation_space)
-        self.time_limit, self.noise_std = time_limit, check_noise_std(noise_std, self._partial.space, PARTIAL)
+        self.time_limit, self.noise_std = time_limit, noise_std
         noisy = noisy_box(self._partial.space, self.noise_std)
         space = spaces.Dict({PARTIAL: noisy, PRIVILEGED: self._privileged.space})
         super().__init__(n_envs, space, _in_float32(action_space))
         actions = self.action_space
         self._bounds = (actions.low, actions.high) if isinstance(actions, spaces.Box) else None
-        self._is_noisy, self._noise = bool((self.noise_std > 0).any()), np.random.default_rng()
+        self._noise = np.random.default_rng()
         #: Steps so far, the step at which each episode began, and the first of these: no array is touched before an episode
         #: may have reached its time limit
         self._n_steps, self._begun, self._first_begun = 0, np.zeros(self.num_envs, dtype=np.int64), 0
         self._returns = np.zeros(self.num_envs)
         self._has_started, self._created = False, time.time()
         self._actions: np.ndarray | None = None
+
+    @property
+    def noise_std(self) -> np.ndarray:
+        """Standard deviation of the noise from the next step on; the bounds of the space are those of the first one."""
+        return self._noise_std
+
+    @noise_std.setter
+    def noise_std(self, noise_std: float | Sequence[float]) -> None:
+        self._noise_std = check_noise_std(noise_std, self._partial.space, PARTIAL)
+        self._is_noisy = bool((self._noise_std > 0).any())
 
     # --- interface to the simulator ---------------------------------------------------------------------------------
 
