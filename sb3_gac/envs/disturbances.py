@@ -6,7 +6,8 @@ noise, then it is sent, and the policy keeps a history of the values that have a
 
     env = History(DroppedFrames(SensorDelay(SensorNoise(env, 0.1), steps=2), probability=0.1), length=4, actions=True)
 
-A delayed value has the noise that it was measured with, and a value that is shown again has the same noise again.
+A delayed value has the noise that it was measured with, and a value that is shown again has the same noise again. Wrappers in
+another order warn.
 """
 
 from collections import deque
@@ -19,7 +20,7 @@ from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
-from sb3_gac.envs.wrappers import EntryWrapper, History, PreviousAction, SensorNoise, count_wrappers
+from sb3_gac.envs.wrappers import SENT, EntryWrapper, History, PreviousAction, SensorNoise, count_wrappers
 
 FRAME_STREAM = 0x6672616D65  # separates the losses from generators that others seed with the same number
 #: Wrappers that add values of no sensor to an entry; they stand outside of the sensor's disturbances
@@ -37,6 +38,8 @@ class SensorDelay(EntryWrapper):
     :param key: the entry that is late; all others stay as they are
     :raises ValueError: if ``steps`` is no integer of at least 0, or the entry is missing
     """
+
+    _place = SENT
 
     def __init__(self, env: gym.Env, steps: int, key: str = PARTIAL):
         super().__init__(env, key)
@@ -79,6 +82,8 @@ class DroppedFrames(EntryWrapper):
     :param key: the entry whose values are lost; all others stay as they are
     :raises ValueError: if ``probability`` is no number from 0 to 1, or the entry is missing
     """
+
+    _place = SENT
 
     def __init__(self, env: gym.Env, probability: float, key: str = PARTIAL):
         super().__init__(env, key)

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_gac.envs.spaces import PARTIAL, box_entry, concatenate_boxes, take_from_box
-from sb3_gac.envs.wrappers import Observation, reset_with
+from sb3_gac.envs.wrappers import RECEIVED, Observation, reset_with
 
 ACHIEVED_GOAL, DESIRED_GOAL = GOALS = ("achieved_goal", "desired_goal")
 
@@ -26,14 +26,17 @@ class AppendDesiredGoal(gym.Wrapper):
     :raises ValueError: if ``to`` is no list of keys, or the observation lacks one of the entries, or has one of another kind
     """
 
+    _place = RECEIVED
+
     def __init__(self, env: gym.Env, to: Sequence[str] = (PARTIAL,)):
         super().__init__(env)
         if not isinstance(to, Collection) or isinstance(to, str):
             raise ValueError(f"to must be a list of keys, got {to!r}.")
+        self._to = tuple(to)
         space = env.observation_space
         goal = take_from_box(box_entry(space, DESIRED_GOAL), slice(None))
         kept = {key: entry for key, entry in space.spaces.items() if key not in GOALS}  # type: ignore[attr-defined]
-        entries = {key: box_entry(space, key) for key in to}
+        entries = {key: box_entry(space, key) for key in self._to}
         for key, entry in entries.items():
             if len(entry.shape) != 1 or not np.issubdtype(entry.dtype, np.floating):
                 raise ValueError(f'AppendDesiredGoal needs a one-dimensional, floating-point entry "{key}", not {entry}.')

@@ -7,6 +7,7 @@ Each is a picklable ``gymnasium.Wrapper``, and passes the environment checkers o
     env = History(SensorNoise(env, noise_std=0.1), length=4, actions=True)
 """
 
+import warnings
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Collection, Sequence
@@ -119,13 +120,39 @@ class SplitDictObservation(_SplitWrapper):
         return {**split, **{key: observation[key].astype(dtype) for key, dtype in self._kept.items()}}
 
 
+#: Places of wrappers of an entry, from the inside to the outside: at the sensor, on the way, and in the policy's hands
+MEASURED, SENT, RECEIVED = 0, 1, 2
+
+
 class EntryWrapper(gym.Wrapper, ABC):
     """Base of wrappers that change one entry of a Dict observation."""
+
+    #: Place among the other wrappers of the entry, ``None`` where any will do
+    _place: int | None = None
 
     def __init__(self, env: gym.Env, key: str):
         super().__init__(env)
         self._key = key
         self._entry = box_entry(env.observation_space, key)
+        self._warn_of_order()
+
+    def _warn_of_order(self) -> None:
+        """Warn if the wrapper disturbs what was made of the sensor's values further inside."""
+        layer: Any = self.env
+        while self._place is not None and isinstance(layer, gym.Wrapper):
+            place = getattr(type(layer), "_place", None)
+            if (
+                place is not None
+                and place > self._place
+                and self._key in getattr(layer, "_to", [getattr(layer, "_key", None)])
+            ):
+                own, inner = type(self).__name__, type(layer).__name__
+                warnings.warn(
+                    f'{own} stands outside of {inner}, and also disturbs what {inner} has made of the entry "{self._key}": '
+                    f"make it {inner}({own}(env, ...), ...).",
+                    stacklevel=4,
+                )
+            layer = layer.env
 
     def _set_entry_space(self, box: spaces.Box) -> None:
         entries = self.env.observation_space.spaces  # type: ignore[attr-defined]
@@ -170,6 +197,8 @@ class SensorNoise(EntryWrapper):
     :param key: the entry that becomes noisy
     :raises ValueError: if ``noise_std`` is negative, not finite or of another shape, or the entry is missing or holds integers
     """
+
+    _place = MEASURED
 
     def __init__(self, env: gym.Env, noise_std: float | Sequence[float], key: str = PARTIAL):
         super().__init__(env, key)
@@ -225,6 +254,8 @@ class History(EntryWrapper):
     :raises ValueError: if ``length`` is no positive integer, or the entry or the actions are of another kind
     """
 
+    _place = RECEIVED
+
     def __init__(self, env: gym.Env, length: int, actions: bool = False, key: str = PARTIAL):
         super().__init__(env, key)
         length = check_count("length", length)
@@ -274,6 +305,8 @@ class PreviousAction(EntryWrapper):
     :param key: key of the entry that gets the action
     :raises ValueError: if the entry is not a floating-point vector, or the actions are neither Box nor Discrete
     """
+
+    _place = RECEIVED
 
     def __init__(self, env: gym.Env, reward: bool = False, key: str = PARTIAL):
         super().__init__(env, key)

@@ -257,6 +257,39 @@ def test_added_noise_and_losses_are_independent_of_those_further_out():
     assert abs(np.corrcoef(*lost)[0, 1]) < 4 / np.sqrt(400)
 
 
+GOALS = spaces.Dict({key: spaces.Box(-9, 9, (2,)) for key in ("partial", "privileged", "desired_goal")})
+
+
+@pytest.mark.parametrize(
+    ("wrap", "said"),
+    [
+        (
+            lambda: SensorNoise(History(Still(PAIR), 3), 0.1),
+            r"SensorNoise stands outside of History.*History\(SensorNoise\(env",
+        ),
+        (lambda: SensorNoise(SensorDelay(Still(PAIR), 3), 0.1), "SensorNoise stands outside of SensorDelay"),
+        (lambda: SensorNoise(DroppedFrames(Still(PAIR), 0.1), 0.1), "SensorNoise stands outside of DroppedFrames"),
+        (
+            lambda: SensorDelay(gym.wrappers.TimeLimit(PreviousAction(Still(PAIR)), 9), 2),
+            "SensorDelay stands outside of Previous",
+        ),
+        (lambda: DroppedFrames(History(Still(PAIR), 2), 0.1), 'DroppedFrames stands outside of History.*"partial"'),
+        (lambda: SensorNoise(AppendDesiredGoal(Still(GOALS)), 0.1), "SensorNoise stands outside of AppendDesiredGoal"),
+    ],
+)
+def test_another_order_than_that_of_a_robot_warns(wrap, said):
+    with pytest.warns(UserWarning, match=said):
+        wrap()
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_order_of_a_robot_and_wrappers_of_other_entries_do_not_warn():
+    env = DroppedFrames(SensorDelay(SensorNoise(SensorNoise(Still(GOALS), 0.1), 0.1), 1), 0.1)
+    PreviousAction(History(AppendDesiredGoal(SensorDelay(env, 1)), 2))
+    SensorNoise(History(SensorDelay(Still(PAIR), 1, key="privileged"), 2, key="privileged"), 0.1)
+    SensorNoise(AppendDesiredGoal(Still(GOALS)), 0.1, key="privileged")
+
+
 def test_a_goal_is_no_measurement():
     env = gym.make("sb3_gac/FetchReach-v4", delay=3)
     other = disturb(gym.make("sb3_gac/FetchReach-v4"), delay=3)

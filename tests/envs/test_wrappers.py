@@ -110,7 +110,7 @@ CHAINS = {
     "history": (PAIR, lambda env: History(env, 3)),
     "history of images": (IMAGE, lambda env: History(env, 3)),
     "split, noise, history": (FLAT, lambda env: History(SensorNoise(_split(env), 0.1), 3, actions=True)),
-    "split, history, noise": (FLAT, lambda env: SensorNoise(History(_split(env), 3, actions=True), 0.1)),
+    "split, history, noise": (FLAT, lambda env: SensorNoise(History(_split(env), 3, key="privileged"), 0.1)),
     "history, history": (PAIR, lambda env: History(History(env, 2, actions=True), 2)),
     "delay": (PAIR, lambda env: SensorDelay(env, 2)),
     "delay of images": (IMAGE, lambda env: SensorDelay(env, 1)),
@@ -406,10 +406,10 @@ def test_history_of_images_joins_them_along_the_first_axis():
 
 
 def test_history_of_images_with_channels_last_is_what_sb3_stacks():
-    space = spaces.Dict(partial=_box(5, 4, 3, dtype=np.uint8))
+    space = spaces.Dict(partial=_box(8, 9, 3, dtype=np.uint8))
     ours = VecTransposeImage(DummyVecEnv([lambda: History(Strict(space), 2)]))
     stacked = VecTransposeImage(VecFrameStack(DummyVecEnv([lambda: Strict(space)]), 2))
-    assert ours.observation_space == stacked.observation_space == spaces.Dict(partial=_box(6, 5, 4, dtype=np.uint8))
+    assert ours.observation_space == stacked.observation_space == spaces.Dict(partial=_box(6, 8, 9, dtype=np.uint8))
     ours.reset()
     stacked.reset()
     for _ in range(3):
