@@ -236,7 +236,7 @@ class SensorNoise(EntryWrapper):
             noise = self._generator.standard_normal((self._block, *self._entry.shape), dtype=np.float32) * self.noise_std
             self._drawn, self._n_used = noise.astype(self._entry.dtype), 0
         self._n_used += 1
-        return value + self._drawn[self._n_used - 1]
+        return np.asarray(value + self._drawn[self._n_used - 1])  # the sum of two numbers in arrays is none
 
 
 class History(EntryWrapper):

@@ -177,11 +177,36 @@ def test_closing_closes_the_simulator():
     assert env.simulator.is_closed
 
 
+class Plain:
+    """A simulator that is none of gymnasium's environments, and has no more than it needs."""
+
+    def __init__(self):
+        inner = Simulator(n_envs=2)
+        self.num_envs, self.reset, self.step = inner.num_envs, inner.reset, inner.step
+        self.single_observation_space, self.single_action_space = inner.single_observation_space, inner.single_action_space
+
+
+def test_a_simulator_needs_no_more_than_is_said():
+    env = GroupsVecEnv(Plain())
+    env.reset()
+    assert env.step(np.zeros((2, 1)))[0]["partial"].tolist() == [[0, 1], [1, 1]]
+    env.close()
+
+
+def test_a_simulator_that_has_less_is_told():
+    simulator = Plain()
+    del simulator.single_action_space, simulator.step
+    with pytest.raises(ValueError, match=r"simulator must have num_envs, .* lacks single_action_space, step"):
+        GroupsVecEnv(simulator)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"max_action": np.inf}, "max_action must be a finite number above 0"),
         ({"max_action": 0.0}, "max_action"),
+        ({"max_action": "1"}, "max_action must be a finite number above 0, got '1'"),
+        ({"max_action": [1.0]}, "max_action must be a finite number above 0"),
         ({"partial": ["actor"]}, 'no entry "actor"'),
         ({"privileged": []}, "privileged must be"),
         ({"noise_std": -1.0}, "noise_std"),

@@ -31,6 +31,7 @@ def _box(*shape, dtype=np.float32):
 FLAT = _box(6, dtype=np.float64)
 PAIR = spaces.Dict(partial=_box(2), privileged=_box(3))
 IMAGE = spaces.Dict(partial=_box(1, 36, 36, dtype=np.uint8), privileged=_box(3))
+NUMBER = spaces.Dict(partial=_box(), privileged=_box())
 GOAL = spaces.Dict(
     achieved_goal=_box(2, dtype=np.float64), desired_goal=_box(2, dtype=np.float64), observation=_box(6, dtype=np.float64)
 )
@@ -279,6 +280,12 @@ def test_sigma_zero_leaves_bounds_and_values():
 def test_noise_keeps_a_float64_entry_float64():
     env = SensorNoise(Strict(spaces.Dict(partial=_box(2, dtype=np.float64))), 0.1)
     assert env.observation_space["partial"].dtype == env.reset(seed=0)[0]["partial"].dtype == np.float64
+
+
+def test_noise_on_a_number_gives_an_array():
+    env = SensorNoise(Strict(NUMBER), 0.1)
+    assert isinstance(env.reset(seed=0)[0]["partial"], np.ndarray)
+    assert env.step(NO_ACTION)[0]["partial"].shape == ()
 
 
 def test_noise_does_not_write_into_the_observation_it_was_given():

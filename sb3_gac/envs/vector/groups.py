@@ -10,6 +10,7 @@ from gymnasium import spaces
 from sb3_gac.envs.selections import KeySelection
 from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv
 
+_NEEDED = ("num_envs", "single_observation_space", "single_action_space", "reset", "step")
 Groups = dict[str, np.ndarray]
 
 
@@ -48,10 +49,12 @@ class GroupsVecEnv(BatchVecEnv):
         final_key: str | None = None,
         noise_std: float | Sequence[float] = 0.0,
     ):
-        if not 0 < max_action < np.inf:
+        if not isinstance(max_action, (int, float, np.integer, np.floating)) or not 0 < max_action < np.inf:
             raise ValueError(f"max_action must be a finite number above 0, got {max_action!r}.")
         self.simulator, self.final_key = simulator, final_key
-        of_one = simulator.unwrapped
+        of_one = getattr(simulator, "unwrapped", simulator)
+        if missing := [name for name in _NEEDED if not hasattr(of_one, name)]:
+            raise ValueError(f"simulator must have {', '.join(_NEEDED)}, but {of_one!r} lacks {', '.join(missing)}.")
         super().__init__(
             of_one.num_envs,
             of_one.single_observation_space,
@@ -108,8 +111,9 @@ class GroupsVecEnv(BatchVecEnv):
         return BatchStep(last, _array(rewards), terminated, truncated & ~terminated)
 
     def close(self) -> None:
-        """Close the simulator."""
-        self.simulator.close()
+        """Close the simulator, if it can be closed."""
+        if hasattr(self.simulator, "close"):
+            self.simulator.close()
 
     def _reset(self, **given: Any) -> Groups:
         groups, self.extras = self.simulator.reset(**given)
