@@ -20,7 +20,7 @@ from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
-from sb3_gac.envs.wrappers import SENT, EntryWrapper, History, PreviousAction, SensorNoise, count_wrappers
+from sb3_gac.envs.wrappers import SENT, EntryWrapper, History, PreviousAction, SensorNoise, count_wrappers, entries_changed_by
 
 FRAME_STREAM = 0x6672616D65  # separates the losses from generators that others seed with the same number
 #: Wrappers that add values of no sensor to an entry; they stand outside of the sensor's disturbances
@@ -149,27 +149,35 @@ def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 
     :return: the environment, whose outermost layer may be a new wrapper
     :raises ValueError: if an argument is wrong; the message names it
     """
-
     if noise_std != 0:
         env = insert_above(env, _measured_layer(env, key), lambda inner: SensorNoise(inner, noise_std, key))
-    return insert_above(env, sensor_layer(env), lambda inner: delayed_and_dropped(inner, delay, drop, key))
+    return insert_above(env, sensor_layer(env, key), lambda inner: delayed_and_dropped(inner, delay, drop, key))
 
 
-def sensor_layer(env: gym.Env) -> gym.Env:
+def sensor_layer(env: gym.Env, key: str = PARTIAL) -> gym.Env:
     """
     Find the layer at which the sensor's signal ends.
 
     :param env: environment in its wrappers
-    :return: outermost layer whose observation comes from the sensor alone
+    :param key: key of the sensor's entry
+    :return: outermost layer in which the entry comes from the sensor alone
     """
-    outside = [number for number, layer in enumerate(layers(env)) if isinstance(layer, _AFTER_THE_SENSOR)]
+    outside = [
+        number
+        for number, layer in enumerate(layers(env))
+        if isinstance(layer, _AFTER_THE_SENSOR) and key in entries_changed_by(layer)
+    ]
     return layers(env)[outside[-1] + 1 if outside else 0]
 
 
 def _measured_layer(env: gym.Env, key: str) -> gym.Env:
     """Outermost layer of the sensor beneath all delays and losses of the entry, which come after the measurement."""
-    signal = sensor_layer(env)
-    sending = [layer for layer in layers(signal) if isinstance(layer, (SensorDelay, DroppedFrames)) and layer._key == key]
+    signal = sensor_layer(env, key)
+    sending = [
+        layer
+        for layer in layers(signal)
+        if isinstance(layer, (SensorDelay, DroppedFrames)) and key in entries_changed_by(layer)
+    ]
     return sending[-1].env if sending else signal
 
 

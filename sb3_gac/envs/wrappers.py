@@ -141,11 +141,7 @@ class EntryWrapper(gym.Wrapper, ABC):
         layer: Any = self.env
         while self._place is not None and isinstance(layer, gym.Wrapper):
             place = getattr(type(layer), "_place", None)
-            if (
-                place is not None
-                and place > self._place
-                and self._key in getattr(layer, "_to", [getattr(layer, "_key", None)])
-            ):
+            if place is not None and place > self._place and self._key in entries_changed_by(layer):
                 own, inner = type(self).__name__, type(layer).__name__
                 warnings.warn(
                     f'{own} stands outside of {inner}, and also disturbs what {inner} has made of the entry "{self._key}": '
@@ -337,6 +333,16 @@ class PreviousAction(EntryWrapper):
         if self._reward:
             added[-1] = reward
         return np.concatenate([value, added], dtype=self._entry.dtype)
+
+
+def entries_changed_by(layer: gym.Env) -> Sequence[str]:
+    """
+    :param layer: environment or wrapper
+    :return: keys of the entries that it changes, if it is one of this package's wrappers of entries, else none
+    """
+    if isinstance(layer, EntryWrapper):
+        return [layer._key]
+    return getattr(layer, "_to", ()) if isinstance(layer, gym.Wrapper) else ()
 
 
 def count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:

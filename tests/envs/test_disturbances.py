@@ -15,6 +15,7 @@ from sb3_gac.envs.state import env_state, layers, restore_env_state
 from tests.envs.test_wrappers import IMAGE, PAIR, Reusing, Still, Strict
 
 ACTION = np.zeros(1, dtype=np.float32)
+GOALS = spaces.Dict({key: spaces.Box(-9, 9, (2,)) for key in ("partial", "privileged", "desired_goal")})
 
 
 class Counting(gym.Env):
@@ -245,6 +246,15 @@ def test_added_noise_is_that_of_the_measurement_where_the_environment_has_delays
     np.testing.assert_array_equal(shown, [shown[0]] * 10, "a value that is shown again has the same noise")
 
 
+def test_a_memory_of_another_entry_is_none_of_the_sensors():
+    env = disturb(SensorNoise(History(Still(PAIR), 2, key="privileged"), 0.5), drop=1.0)
+    assert [type(layer) for layer in layers(env)] == [DroppedFrames, SensorNoise, History, Still]
+    shown = _seen(env, 5)
+    np.testing.assert_array_equal(shown, [shown[0]] * 6, "a value that is shown again has the same noise")
+    other = disturb(AppendDesiredGoal(SensorNoise(Still(GOALS), 0.5)), drop=1.0, key="privileged")
+    assert [type(layer) for layer in layers(other)] == [DroppedFrames, AppendDesiredGoal, SensorNoise, Still]
+
+
 def test_added_noise_and_losses_are_independent_of_those_further_out():
     space = spaces.Dict(partial=spaces.Box(-9, 9, (2,)), privileged=spaces.Box(-9, 9, (2,)))
     env = disturb(SensorNoise(History(Still(space), 1), 0.5, key="privileged"), noise_std=0.5)
@@ -255,9 +265,6 @@ def test_added_noise_and_losses_are_independent_of_those_further_out():
     seen = [counting.reset(seed=0)[0], *(counting.step(ACTION)[0] for _ in range(400))]
     lost = [np.diff([values[key][0] for values in seen]) == 0 for key in ("partial", "privileged")]
     assert abs(np.corrcoef(*lost)[0, 1]) < 4 / np.sqrt(400)
-
-
-GOALS = spaces.Dict({key: spaces.Box(-9, 9, (2,)) for key in ("partial", "privileged", "desired_goal")})
 
 
 @pytest.mark.parametrize(
