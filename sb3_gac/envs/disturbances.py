@@ -6,7 +6,8 @@ noise, then it is sent, and the policy keeps a history of the values that have a
 
     env = History(DroppedFrames(SensorDelay(SensorNoise(env, 0.1), steps=2), probability=0.1), length=4, actions=True)
 
-A delayed value has the noise that it was measured with, and a value that is shown again has the same noise again.
+A delayed value has the noise that it was measured with, and a value that is shown again has the same noise again. Wrappers in
+another order warn.
 """
 
 from collections import deque
@@ -15,10 +16,11 @@ from collections.abc import Callable
 import gymnasium as gym
 import numpy as np
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
-from sb3_gac.envs.wrappers import EntryWrapper, History, PreviousAction, SensorNoise, count_wrappers
+from sb3_gac.envs.wrappers import SENT, EntryWrapper, History, PreviousAction, SensorNoise, count_wrappers, entries_changed_by
 
 FRAME_STREAM = 0x6672616D65  # separates the losses from generators that others seed with the same number
 #: Wrappers that add values of no sensor to an entry; they stand outside of the sensor's disturbances
@@ -37,12 +39,26 @@ class SensorDelay(EntryWrapper):
     :raises ValueError: if ``steps`` is no integer of at least 0, or the entry is missing
     """
 
+    _place = SENT
+
     def __init__(self, env: gym.Env, steps: int, key: str = PARTIAL):
         super().__init__(env, key)
-        if not isinstance(steps, (int, np.integer)) or isinstance(steps, bool) or steps < 0:
-            raise ValueError(f"steps must be an integer of at least 0, by which the entry is late, got {steps!r}.")
-        self.steps = int(steps)
+        self._steps = self._checked(steps)
         self._values: deque[np.ndarray] = deque(maxlen=self.steps + 1)
+
+    @staticmethod
+    def _checked(steps: int) -> int:
+        return check_count("steps", steps, 0, "by which the entry is late")
+
+    @property
+    def steps(self) -> int:
+        """Number of steps by which the entry is late; a larger one takes effect as further values are measured."""
+        return self._steps
+
+    @steps.setter
+    def steps(self, steps: int) -> None:
+        self._steps = self._checked(steps)
+        self._values = deque(self._values, self._steps + 1)
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         self._values.extend([value.copy()] * (self.steps + 1))
@@ -67,15 +83,21 @@ class DroppedFrames(EntryWrapper):
     :raises ValueError: if ``probability`` is no number from 0 to 1, or the entry is missing
     """
 
+    _place = SENT
+
     def __init__(self, env: gym.Env, probability: float, key: str = PARTIAL):
         super().__init__(env, key)
         is_number = isinstance(probability, (int, float, np.integer, np.floating)) and not isinstance(probability, bool)
         if not is_number or not 0 <= probability <= 1:
             raise ValueError(f"probability must be a number from 0 to 1, with which a value is lost, got {probability!r}.")
         self.probability = float(probability)
-        self._stream = [FRAME_STREAM] * (1 + count_wrappers(env, DroppedFrames))  # separate from losses of inner wrappers
         self._generator = np.random.default_rng()
         self._shown = np.empty(0)
+
+    @property
+    def _stream(self) -> list[int]:
+        """Name of the losses' random numbers, separate from those of inner wrappers, which :func:`disturb` may add later."""
+        return [FRAME_STREAM] * (1 + count_wrappers(self.env, DroppedFrames))
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         if seed is not None:
@@ -115,8 +137,9 @@ def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 
     Disturb the sensor of an environment that has wrappers already.
 
     The new wrappers stand directly around the sensor's signal, beneath every history, previous action and goal: these are the
-    policy's own and need no sensor. The function is for evaluations: the outer wrappers keep the bounds of their spaces,
-    although noisy values may go beyond them.
+    policy's own and need no sensor. New noise stands beneath the environment's own delays and losses as well: a value that is
+    late or shown again keeps the noise of its measurement. The function is for evaluations: the outer wrappers keep the bounds
+    of their spaces, although noisy values may go beyond them.
 
     :param env: environment in its wrappers, changed in place, which must not have been reset yet
     :param noise_std: standard deviation of noise on top of the environment's own, 0 for none
@@ -126,23 +149,36 @@ def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 
     :return: the environment, whose outermost layer may be a new wrapper
     :raises ValueError: if an argument is wrong; the message names it
     """
-
-    def wrap(inner: gym.Env) -> gym.Env:
-        noisy = inner if noise_std == 0 else SensorNoise(inner, noise_std, key)
-        return delayed_and_dropped(noisy, delay, drop, key)
-
-    return insert_above(env, sensor_layer(env), wrap)
+    if noise_std != 0:
+        env = insert_above(env, _measured_layer(env, key), lambda inner: SensorNoise(inner, noise_std, key))
+    return insert_above(env, sensor_layer(env, key), lambda inner: delayed_and_dropped(inner, delay, drop, key))
 
 
-def sensor_layer(env: gym.Env) -> gym.Env:
+def sensor_layer(env: gym.Env, key: str = PARTIAL) -> gym.Env:
     """
     Find the layer at which the sensor's signal ends.
 
     :param env: environment in its wrappers
-    :return: outermost layer whose observation comes from the sensor alone
+    :param key: key of the sensor's entry
+    :return: outermost layer in which the entry comes from the sensor alone
     """
-    outside = [number for number, layer in enumerate(layers(env)) if isinstance(layer, _AFTER_THE_SENSOR)]
+    outside = [
+        number
+        for number, layer in enumerate(layers(env))
+        if isinstance(layer, _AFTER_THE_SENSOR) and key in entries_changed_by(layer)
+    ]
     return layers(env)[outside[-1] + 1 if outside else 0]
+
+
+def _measured_layer(env: gym.Env, key: str) -> gym.Env:
+    """Outermost layer of the sensor beneath all delays and losses of the entry, which come after the measurement."""
+    signal = sensor_layer(env, key)
+    sending = [
+        layer
+        for layer in layers(signal)
+        if isinstance(layer, (SensorDelay, DroppedFrames)) and key in entries_changed_by(layer)
+    ]
+    return sending[-1].env if sending else signal
 
 
 def insert_above(env: gym.Env, layer: gym.Env, wrap: Callable[[gym.Env], gym.Env]) -> gym.Env:

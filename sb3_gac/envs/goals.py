@@ -1,6 +1,6 @@
 """Goals of goal environments: entries of their own, for hindsight, or parts of ``partial``."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_gac.envs.spaces import PARTIAL, box_entry, concatenate_boxes, take_from_box
-from sb3_gac.envs.wrappers import Observation, reset_with
+from sb3_gac.envs.wrappers import RECEIVED, Observation, reset_with
 
 ACHIEVED_GOAL, DESIRED_GOAL = GOALS = ("achieved_goal", "desired_goal")
 
@@ -22,19 +22,26 @@ class AppendDesiredGoal(gym.Wrapper):
 
     :param env: environment with a Dict observation that has ``desired_goal``, which ``keep`` of
         :class:`~sb3_gac.envs.wrappers.SplitDictObservation` leaves there
-    :param to: keys of the entries that get the goal; these entries are one-dimensional and float32
-    :raises ValueError: if ``to`` is no list of keys, or the observation lacks one of the entries
+    :param to: keys of the entries that get the goal; these entries are vectors of floats
+    :raises ValueError: if ``to`` is no list of keys, or the observation lacks one of the entries, or has one of another kind
     """
+
+    _place = RECEIVED
 
     def __init__(self, env: gym.Env, to: Sequence[str] = (PARTIAL,)):
         super().__init__(env)
-        if isinstance(to, str):
+        if not isinstance(to, Collection) or isinstance(to, str):
             raise ValueError(f"to must be a list of keys, got {to!r}.")
+        self._to = tuple(to)
         space = env.observation_space
         goal = take_from_box(box_entry(space, DESIRED_GOAL), slice(None))
-        self._to = tuple(to)
         kept = {key: entry for key, entry in space.spaces.items() if key not in GOALS}  # type: ignore[attr-defined]
-        joined = {key: concatenate_boxes([box_entry(space, key), goal]) for key in self._to}
+        entries = {key: box_entry(space, key) for key in self._to}
+        for key, entry in entries.items():
+            if len(entry.shape) != 1 or not np.issubdtype(entry.dtype, np.floating):
+                raise ValueError(f'AppendDesiredGoal needs a one-dimensional, floating-point entry "{key}", not {entry}.')
+        joined = {key: concatenate_boxes([entry, goal]) for key, entry in entries.items()}
+        self._types = {key: entry.dtype for key, entry in entries.items()}
         self.observation_space = spaces.Dict({**kept, **joined})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
@@ -57,4 +64,5 @@ class AppendDesiredGoal(gym.Wrapper):
     def _with_goal(self, observation: Observation) -> Observation:
         kept = {key: value for key, value in observation.items() if key not in GOALS}
         goal = np.ravel(observation[DESIRED_GOAL])
-        return {**kept, **{key: np.concatenate([observation[key], goal], dtype=np.float32) for key in self._to}}
+        joined = {key: np.concatenate([observation[key], goal], dtype=dtype) for key, dtype in self._types.items()}
+        return {**kept, **joined}

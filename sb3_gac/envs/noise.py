@@ -18,7 +18,10 @@ def check_noise_std(noise_std: float | Sequence[float], entry: spaces.Box, key: 
     :return: standard deviation as a float32 array, of shape () or that of the entry
     :raises ValueError: if ``noise_std`` is negative, not finite or of another shape, or the entry holds integers
     """
-    std = np.asarray(noise_std, dtype=np.float32)
+    try:
+        std = np.asarray(noise_std, dtype=np.float32)
+    except (TypeError, ValueError):  # no numbers at all
+        std = np.asarray(np.nan)
     if not (np.isfinite(std).all() and (std >= 0).all()):
         raise ValueError(f"noise_std must be a finite number >= 0, or one per component, got {noise_std!r}.")
     if not np.issubdtype(entry.dtype, np.floating):

@@ -1,6 +1,6 @@
 """Selections of an observation's components for an entry: indices of a flat observation, keys of a Dict."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -75,10 +75,13 @@ def check_indices(name: str, indices: Indices, space: spaces.Box) -> np.ndarray:
     :raises ValueError: if an index is outside the space, or there is none
     """
     size = int(np.prod(space.shape))
-    array = np.arange(size)[indices] if isinstance(indices, slice) else np.asarray(list(indices))
+    given = list(indices) if isinstance(indices, Iterable) else indices
+    try:
+        array = np.arange(size)[given] if isinstance(given, slice) else np.asarray(given)
+    except ValueError:  # lists of different lengths
+        array = np.empty(0)
     is_list = array.ndim == 1 and array.size > 0 and np.issubdtype(array.dtype, np.integer)
     if not is_list or array.min() < 0 or array.max() >= size:
-        given = indices if isinstance(indices, slice) else list(indices)
         raise ValueError(f"{name} must be a non-empty list of indices in 0..{size - 1}, got {given}.")
     return array
 
@@ -93,7 +96,9 @@ def check_keys(name: str, selection: KeySelection, space: spaces.Dict) -> dict[s
     :return: key -> array of indices, or a slice for the whole entry
     :raises ValueError: if a key or an index is unknown, or there is none
     """
-    if isinstance(selection, (str, slice)) or not selection:
+    # A set has another order in each process, and with it an entry's components
+    is_ordered = isinstance(selection, Collection) and not isinstance(selection, (str, set, frozenset))
+    if not is_ordered or len(selection) == 0:
         raise ValueError(f"{name} must be a non-empty list of keys, or a mapping from keys to indices, got {selection!r}.")
     by_key: Mapping[str, Indices | None] = selection if isinstance(selection, Mapping) else dict.fromkeys(selection)
     resolved: dict[str, Any] = {}

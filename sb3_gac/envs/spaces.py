@@ -23,8 +23,16 @@ def box_entry(space: spaces.Space, key: str) -> spaces.Box:
         raise ValueError(f'The observation has no entry "{key}"; its space is {space}.')
     entry = space[key]
     if not isinstance(entry, spaces.Box):
-        raise ValueError(f'The entry "{key}" must be a Box, but is {entry}.')
+        raise ValueError(f'The entry "{key}" must be a Box, but is {entry}: make it one in the environment.')
     return entry
+
+
+def has_channels_last(box: spaces.Box) -> bool:
+    """
+    :param box: Box of any shape
+    :return: whether the Box is of images in bytes whose last axis, the smallest, has the channels
+    """
+    return box.dtype == np.uint8 and len(box.shape) == 3 and box.shape[2] < min(box.shape[:2])
 
 
 def take_from_box(box: spaces.Box, index: Any) -> spaces.Box:
@@ -39,12 +47,13 @@ def take_from_box(box: spaces.Box, index: Any) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def concatenate_boxes(boxes: Sequence[spaces.Box]) -> spaces.Box:
+def concatenate_boxes(boxes: Sequence[spaces.Box], axis: int = 0) -> spaces.Box:
     """
-    Join Boxes along their first axis.
+    Join Boxes along an axis.
 
-    :param boxes: Boxes that are equal in all axes but the first
-    :return: Box that joins them along the first axis
+    :param boxes: Boxes that are equal in all other axes
+    :param axis: axis along which they are joined
+    :return: Box that joins them
     """
-    low, high = np.concatenate([box.low for box in boxes]), np.concatenate([box.high for box in boxes])
+    low, high = (np.concatenate(bounds, axis) for bounds in zip(*((box.low, box.high) for box in boxes), strict=True))
     return spaces.Box(low, high, dtype=boxes[0].dtype)

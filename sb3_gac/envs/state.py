@@ -52,10 +52,11 @@ CHANGING: dict[str, tuple[str, ...]] = {
 #: Flags of gymnasium's checker that are set when a state is restored: an episode's first steps were checked before
 _CHECKED = ("checked_reset", "checked_step", "checked_data_reuse")
 _MUJOCO = "mujoco"  # key of the state of MuJoCo's model and data in a layer's state
-#: Attributes that a reset draws, and prefixes of the arrays in MuJoCo's model that a reset may change
+#: Attributes that a reset draws, and prefixes of the arrays in MuJoCo's model that a reset may change, beside its options
 _DRAWN = ("goal",)
 _ADDRESSES = ("plugin_data",)  # memory addresses of plugins' data, which another process can't use
-_PARTS = ("actuator_", "body_", "dof_", "geom_", "jnt_", "site_")
+LOOKS = ("cam_", "geom_", "light_", "mat_", "site_", "tendon_")
+_PARTS = (*LOOKS, "actuator_", "body_", "dof_", "eq_", "hfield_data", "jnt_", "pair_", "qpos")
 
 
 class NotRestorableError(ValueError):
@@ -91,13 +92,13 @@ def restore_env_state(env: gym.Env, states: list[dict[str, Any]]) -> None:
     Put an environment back into a state.
 
     :param env: environment in the same wrappers, changed in place
-    :param states: state of each layer, as :func:`env_state` returns it
+    :param states: state of each layer, as :func:`env_state` returns it; it may be restored again later
     :raises NotRestorableError: if the environment has other layers
     """
     names, expected = [_name(layer) for layer in layers(env)], [state["class"] for state in states]
     if names != expected:
         raise NotRestorableError(f"the environment is made of {names}, but the checkpoint's was made of {expected}")
-    for layer, state in zip(layers(env), states, strict=True):
+    for layer, state in zip(layers(env), deepcopy(states), strict=True):  # the next steps write into arrays and generators
         _restore_layer(layer, {key: value for key, value in state.items() if key != "class"})
 
 
@@ -157,8 +158,9 @@ def _mujoco_state(layer: Any) -> dict[str, Any]:
     mujoco.mj_getState(layer.model, layer.data, state, spec)
     return {
         "state": state,
-        "derived": {name: array.copy() for name, array in _arrays(layer.data).items()},
-        "model": {name: array.copy() for name, array in _arrays(layer.model, _PARTS).items() if array.dtype == np.float64},
+        "derived": {name: array.copy() for name, array in arrays_of(layer.data).items()},
+        "model": {name: array.copy() for name, array in arrays_of(layer.model, _PARTS).items()},
+        "options": _options(layer.model.opt),
         "drawn": {name: deepcopy(getattr(layer, name)) for name in _DRAWN if hasattr(layer, name)},
     }
 
@@ -168,11 +170,13 @@ def _restore_mujoco(layer: Any, saved: dict[str, Any]) -> None:
 
     for name, value in saved.get("drawn", {}).items():  # files of earlier versions have no such entry
         setattr(layer, name, value)
-    _write(_arrays(layer.model, _PARTS), saved.get("model", {}))
+    _write(arrays_of(layer.model, _PARTS), saved.get("model", {}))
+    for name, value in saved.get("options", {}).items():
+        setattr(layer.model.opt, name, value)
     mujoco.mj_setState(layer.model, layer.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION)
     mujoco.mj_forward(layer.model, layer.data)  # makes as many contacts as there were, and arrays of that size
     mujoco.mj_setState(layer.model, layer.data, saved["state"], mujoco.mjtState.mjSTATE_INTEGRATION)
-    _write(_arrays(layer.data), saved["derived"])
+    _write(arrays_of(layer.data), saved["derived"])
 
 
 def _write(arrays: dict[str, np.ndarray], saved: dict[str, np.ndarray]) -> None:
@@ -181,8 +185,17 @@ def _write(arrays: dict[str, np.ndarray], saved: dict[str, np.ndarray]) -> None:
             array[...] = saved[name]
 
 
-def _arrays(struct: Any, prefixes: tuple[str, ...] = ("",)) -> dict[str, np.ndarray]:
-    """Arrays of MuJoCo's model or data whose names begin with one of the prefixes, by name."""
+def _options(opt: Any) -> dict[str, Any]:
+    """Options of MuJoCo's model, such as gravity, wind and the time step."""
+    return {name: deepcopy(getattr(opt, name)) for name in dir(opt) if not name.startswith("_")}
+
+
+def arrays_of(struct: Any, prefixes: tuple[str, ...] = ("",)) -> dict[str, np.ndarray]:
+    """
+    :param struct: MuJoCo's model or data
+    :param prefixes: beginnings of the arrays' names
+    :return: name -> array, not copied, of those that are not empty
+    """
     names = [name for name in dir(struct) if name.startswith(prefixes) and not name.startswith(("_", *_ADDRESSES))]
     arrays = {name: getattr(struct, name) for name in names}
     return {name: array for name, array in arrays.items() if isinstance(array, np.ndarray) and array.size}

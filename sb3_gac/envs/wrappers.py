@@ -7,21 +7,24 @@ Each is a picklable ``gymnasium.Wrapper``, and passes the environment checkers o
     env = History(SensorNoise(env, noise_std=0.1), length=4, actions=True)
 """
 
+import warnings
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
 from sb3_gac.envs.selections import KeySelection, as_slice, check_indices, check_keys
-from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, take_from_box
+from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, has_channels_last, take_from_box
 
 Observation = dict[str, np.ndarray]
-_NOISE_BLOCK = 128  # samples of the noise that are drawn at once: one by one takes several times as long
+#: Samples of the noise that are drawn at once, since one by one takes several times as long; and numbers, for large entries
+_NOISE_BLOCK, _NOISE_NUMBERS = 128, 2**16
 
 
 def reset_with(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
@@ -117,13 +120,35 @@ class SplitDictObservation(_SplitWrapper):
         return {**split, **{key: observation[key].astype(dtype) for key, dtype in self._kept.items()}}
 
 
+#: Places of wrappers of an entry, from the inside to the outside: at the sensor, on the way, and in the policy's hands
+MEASURED, SENT, RECEIVED = 0, 1, 2
+
+
 class EntryWrapper(gym.Wrapper, ABC):
     """Base of wrappers that change one entry of a Dict observation."""
+
+    #: Place among the other wrappers of the entry, ``None`` where any will do
+    _place: int | None = None
 
     def __init__(self, env: gym.Env, key: str):
         super().__init__(env)
         self._key = key
         self._entry = box_entry(env.observation_space, key)
+        self._warn_of_order()
+
+    def _warn_of_order(self) -> None:
+        """Warn if the wrapper disturbs what was made of the sensor's values further inside."""
+        layer: Any = self.env
+        while self._place is not None and isinstance(layer, gym.Wrapper):
+            place = getattr(type(layer), "_place", None)
+            if place is not None and place > self._place and self._key in entries_changed_by(layer):
+                own, inner = type(self).__name__, type(layer).__name__
+                warnings.warn(
+                    f'{own} stands outside of {inner}, and also disturbs what {inner} has made of the entry "{self._key}": '
+                    f"make it {inner}({own}(env, ...), ...).",
+                    stacklevel=4,
+                )
+            layer = layer.env
 
     def _set_entry_space(self, box: spaces.Box) -> None:
         entries = self.env.observation_space.spaces  # type: ignore[attr-defined]
@@ -169,14 +194,29 @@ class SensorNoise(EntryWrapper):
     :raises ValueError: if ``noise_std`` is negative, not finite or of another shape, or the entry is missing or holds integers
     """
 
+    _place = MEASURED
+
     def __init__(self, env: gym.Env, noise_std: float | Sequence[float], key: str = PARTIAL):
         super().__init__(env, key)
-        self.noise_std = check_noise_std(noise_std, self._entry, key)
-        self._set_entry_space(noisy_box(self._entry, self.noise_std))
-        self._stream = [NOISE_STREAM] * (1 + count_wrappers(env, SensorNoise))  # separate from noise of inner wrappers
         self._generator = np.random.default_rng()
-        self._drawn = np.empty((0, *self._entry.shape), dtype=self._entry.dtype)
-        self._n_used = 0
+        self._block = max(1, min(_NOISE_BLOCK, _NOISE_NUMBERS // max(1, self._entry.low.size)))
+        self.noise_std = noise_std
+        self._set_entry_space(noisy_box(self._entry, self.noise_std))
+
+    @property
+    def noise_std(self) -> np.ndarray:
+        """Standard deviation of the noise from the next step on; the bounds of the space are those of the first one."""
+        return self._noise_std
+
+    @noise_std.setter
+    def noise_std(self, noise_std: float | Sequence[float]) -> None:
+        self._noise_std = check_noise_std(noise_std, self._entry, self._key)
+        self._drawn, self._n_used = np.empty((0, *self._entry.shape), dtype=self._entry.dtype), 0
+
+    @property
+    def _stream(self) -> list[int]:
+        """Name of the noise's random numbers, separate from those of inner wrappers, which an evaluation may add later."""
+        return [NOISE_STREAM] * (1 + count_wrappers(self.env, SensorNoise))
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         if seed is not None:
@@ -189,16 +229,17 @@ class SensorNoise(EntryWrapper):
 
     def _noisy(self, value: np.ndarray) -> np.ndarray:
         if self._n_used == len(self._drawn):
-            noise = self._generator.standard_normal((_NOISE_BLOCK, *self._entry.shape), dtype=np.float32) * self.noise_std
+            noise = self._generator.standard_normal((self._block, *self._entry.shape), dtype=np.float32) * self.noise_std
             self._drawn, self._n_used = noise.astype(self._entry.dtype), 0
         self._n_used += 1
-        return value + self._drawn[self._n_used - 1]
+        return np.asarray(value + self._drawn[self._n_used - 1])  # the sum of two numbers in arrays is none
 
 
 class History(EntryWrapper):
     """
     Replace one entry by its last ``length`` values, oldest first, joined along the first axis.
 
+    Images with their channels last are joined along that axis, so that the history is an image of more channels.
     After a reset the first value fills the whole history, and past actions are zero.
 
     :param env: environment with a Dict observation
@@ -206,13 +247,14 @@ class History(EntryWrapper):
     :param actions: whether to append the ``length - 1`` actions between the values; needs Box actions and a one-dimensional
         entry of floats
     :param key: the entry that gets a history
-    :raises ValueError: if ``length`` is not positive, or the entry or the actions are of another kind
+    :raises ValueError: if ``length`` is no positive integer, or the entry or the actions are of another kind
     """
+
+    _place = RECEIVED
 
     def __init__(self, env: gym.Env, length: int, actions: bool = False, key: str = PARTIAL):
         super().__init__(env, key)
-        if length < 1:
-            raise ValueError(f"length must be at least 1, got {length}.")
+        length = check_count("length", length)
         if not self._entry.shape:
             raise ValueError(f'History needs an entry with at least one axis, but "{key}" has {self._entry}.')
         is_vector = len(self._entry.shape) == 1 and np.issubdtype(self._entry.dtype, np.floating)
@@ -229,7 +271,8 @@ class History(EntryWrapper):
         if actions:
             # A policy may hand in actions outside the space, which many environments clip
             boxes += [spaces.Box(-np.inf, np.inf, (n_actions,), np.float32)] * (length - 1)
-        self._set_entry_space(concatenate_boxes(boxes))
+        self._axis = 2 if has_channels_last(self._entry) else 0
+        self._set_entry_space(concatenate_boxes(boxes, self._axis))
 
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         self._values.extend([value.copy()] * (self._values.maxlen or 0))
@@ -244,7 +287,7 @@ class History(EntryWrapper):
 
     def _joined(self) -> np.ndarray:
         parts = [*self._values, *self._actions] if self._no_action.size else list(self._values)
-        return np.concatenate(parts, dtype=self._entry.dtype)
+        return np.concatenate(parts, self._axis, dtype=self._entry.dtype)
 
 
 class PreviousAction(EntryWrapper):
@@ -258,6 +301,8 @@ class PreviousAction(EntryWrapper):
     :param key: key of the entry that gets the action
     :raises ValueError: if the entry is not a floating-point vector, or the actions are neither Box nor Discrete
     """
+
+    _place = RECEIVED
 
     def __init__(self, env: gym.Env, reward: bool = False, key: str = PARTIAL):
         super().__init__(env, key)
@@ -290,6 +335,16 @@ class PreviousAction(EntryWrapper):
         return np.concatenate([value, added], dtype=self._entry.dtype)
 
 
+def entries_changed_by(layer: gym.Env) -> Sequence[str]:
+    """
+    :param layer: environment or wrapper
+    :return: keys of the entries that it changes, if it is one of this package's wrappers of entries, else none
+    """
+    if isinstance(layer, EntryWrapper):
+        return [layer._key]
+    return getattr(layer, "_to", ()) if isinstance(layer, gym.Wrapper) else ()
+
+
 def count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
     """
     :param env: environment in its wrappers
@@ -304,7 +359,7 @@ def count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
 
 
 def _check_kept(keep: Sequence[str]) -> Sequence[str]:
-    if isinstance(keep, str) or {PARTIAL, PRIVILEGED} & set(keep):
+    if not isinstance(keep, Collection) or isinstance(keep, str) or {PARTIAL, PRIVILEGED} & set(keep):
         raise ValueError(f"keep must be a list of keys, other than {PARTIAL!r} and {PRIVILEGED!r}, got {keep!r}.")
     return keep
 

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gac.checks.entries import computable
+from sb3_gac.checks.values import check_integer
 from sb3_gac.replay.frame_stack import resolve_frame_stacks
 from sb3_gac.replay.histories import Histories, steps_before, unbroken
 from sb3_gac.replay.observation_ring import ObservationRing
@@ -66,8 +67,7 @@ class CompactDictReplayBuffer(ShownByStep):
         mask_truncations: bool = False,
     ):
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
-        if n_steps < 1:
-            raise ValueError(f"n_steps must be at least 1, got {n_steps}.")
+        check_integer("n_steps", n_steps, 1)
         if mask_truncations and not handle_timeout_termination:
             raise ValueError("mask_truncations=True needs handle_timeout_termination=True, or no truncation is known.")
         self.mask_truncations = mask_truncations
@@ -77,7 +77,7 @@ class CompactDictReplayBuffer(ShownByStep):
         self.n_steps = n_steps
         self.gamma = gamma
         lengths = resolve_frame_stacks(observation_space, frame_stacks)
-        self.layout = ObservationLayout(observation_space, None if storage_dtype is None else np.dtype(storage_dtype), lengths)
+        self.layout = ObservationLayout(observation_space, storage_dtype, lengths)
         self.n_rows = self.buffer_size + max(lengths.values(), default=1)  # the frames of the oldest stack included
         action_dtype = np.dtype(self._maybe_cast_dtype(action_space.dtype))
         row_bytes = self.layout.row_bytes() + self.action_dim * action_dtype.itemsize + 5

@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_gac.checks.values import check_integer
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.samples import SequenceSamples
 from sb3_gac.replay.shown import DONE, TIME_LIMIT
@@ -71,10 +72,11 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         super().__init__(*args, **kwargs)
         if self.n_steps != 1:
             raise ValueError(f"n_steps must be 1 for sequences, got {self.n_steps}.")
-        if sequence_length is not None and sequence_length < 1:
-            raise ValueError(f"sequence_length must be at least 1, or None for whole episodes, got {sequence_length}.")
-        if burn_in < 0 or (burn_in and sequence_length is None):
-            raise ValueError(f"burn_in must be at least 0, and goes with a sequence_length, got {burn_in}.")
+        if sequence_length is not None:
+            check_integer("sequence_length", sequence_length, 1, remedy="or None for whole episodes")
+        check_integer("burn_in", burn_in, 0)
+        if burn_in and sequence_length is None:
+            raise ValueError(f"burn_in goes with a sequence_length, but that is None for whole episodes, got {burn_in}.")
         self.sequence_length = sequence_length
         self.burn_in = burn_in
         self._forget_episodes()
@@ -98,7 +100,7 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         self._episodes = EpisodeIndex()
         for episode in state["episodes"].tolist():
             self._episodes.append(*episode)
-        self._episode_starts = state["starts"]
+        self._episode_starts = state["starts"].copy()
 
     def add(  # type: ignore[override]
         self,

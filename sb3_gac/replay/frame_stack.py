@@ -1,6 +1,7 @@
 """Observation entries that are stacks of frames; a ring of rows stores each frame once."""
 
 from collections.abc import Mapping
+from types import NoneType
 
 import numpy as np
 from gymnasium import spaces
@@ -23,6 +24,8 @@ def resolve_frame_stacks(space: spaces.Dict, frame_stacks: Mapping[str, int] | N
     :return: entry -> number of its frames, for entries of more than one frame
     :raises ValueError: if an entry does not exist, or can't consist of so many frames; the message names the entry
     """
+    if not isinstance(frame_stacks, (Mapping, NoneType)):
+        raise ValueError(f"frame_stacks must be a mapping from entries to their numbers of frames, got {frame_stacks!r}.")
     for key, length in (frame_stacks or {}).items():
         name = f'frame_stacks["{key}"]'
         if key not in space.spaces:

@@ -20,14 +20,13 @@ class ObservationLayout:
     stack holds its newest frame alone.
 
     :param space: Dict space of observations
-    :param float_dtype: type that floating-point entries are stored in, ``None`` for their own type
+    :param float_dtype: type that floating-point entries are stored in, or its name; ``None`` for their own type
     :param frame_stacks: entry -> number of its frames, see :func:`sb3_gac.replay.frame_stack.resolve_frame_stacks`
     :raises ValueError: if ``float_dtype`` is no floating-point type
     """
 
-    def __init__(self, space: spaces.Dict, float_dtype: np.dtype | None = None, frame_stacks: Mapping[str, int] | None = None):
-        if float_dtype is not None and not np.issubdtype(float_dtype, np.floating):
-            raise ValueError(f'storage_dtype must be a floating-point type such as "float16", or None, got "{float_dtype}".')
+    def __init__(self, space: spaces.Dict, float_dtype: Any = None, frame_stacks: Mapping[str, int] | None = None):
+        float_dtype = None if float_dtype is None else _floating_point(float_dtype)
         self.shapes = {key: stored_shape(entry) for key, entry in space.spaces.items()}
         self._given_shapes = {key: entry.shape or () for key, entry in space.spaces.items()}
         self.dtypes = {key: np.dtype(entry.dtype) for key, entry in space.spaces.items()}
@@ -125,6 +124,16 @@ class ObservationLayout:
             values = rows[group][..., columns].astype(self.dtypes[key], copy=False)
             observation[key] = values.reshape(*values.shape[:-1], *self.shapes[key])
         return observation
+
+
+def _floating_point(given: Any) -> np.dtype:
+    try:
+        dtype = np.dtype(given)
+    except TypeError:  # no type at all
+        dtype = np.dtype(object)
+    if not np.issubdtype(dtype, np.floating):
+        raise ValueError(f'storage_dtype must be a floating-point type such as "float16", or None, got "{given}".')
+    return dtype
 
 
 def _check_range(key: str, values: np.ndarray, stored: np.dtype) -> None:

@@ -12,9 +12,10 @@ from sb3_gac.envs import DroppedFrames, History, PreviousAction, SensorDelay, Se
 from sb3_gac.envs.disturbances import disturb, sensor_layer
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.state import env_state, layers, restore_env_state
-from tests.envs.test_wrappers import IMAGE, PAIR, Reusing, Strict
+from tests.envs.test_wrappers import IMAGE, PAIR, Reusing, Still, Strict
 
 ACTION = np.zeros(1, dtype=np.float32)
+GOALS = spaces.Dict({key: spaces.Box(-9, 9, (2,)) for key in ("partial", "privileged", "desired_goal")})
 
 
 class Counting(gym.Env):
@@ -77,6 +78,18 @@ def test_a_delayed_image_is_the_image_before():
         np.testing.assert_array_equal(seen, before)
         assert seen.dtype == np.uint8
         before = env.unwrapped.latest["partial"].copy()
+
+
+def test_another_delay_counts_from_the_next_step_on():
+    env = SensorDelay(Counting(), 1)
+    assert _seen(env, 4)[:, 0].tolist() == [0, 0, 1, 2, 3]
+    env.steps = 3
+    assert [env.step(ACTION)[0]["partial"][0] for _ in range(4)] == [3, 3, 4, 5]
+    env.steps = 0
+    assert env.step(ACTION)[0]["partial"][0] == 9
+    assert _seen(env, 2)[:, 0].tolist() == [0, 1, 2]
+    with pytest.raises(ValueError, match="steps must be an integer of at least 0"):
+        env.steps = -1
 
 
 @pytest.mark.parametrize("steps", [-1, 1.0, True, "2", None])
@@ -221,6 +234,67 @@ def test_an_environment_with_wrappers_of_its_own_is_disturbed_beneath_its_memory
     ]
     env.reset(seed=0)
     assert env.step(ACTION)[0]["partial"].shape == (3 * 2 + 2 + 1,)
+
+
+def test_added_noise_is_that_of_the_measurement_where_the_environment_has_delays_and_losses_of_its_own():
+    env = History(DroppedFrames(SensorDelay(DroppedFrames(Still(PAIR), 0.0, key="privileged"), 1), 1.0), 2)
+    disturb(env, noise_std=0.5, drop=0.2)
+    kinds = [History, DroppedFrames, DroppedFrames, SensorDelay, SensorNoise, DroppedFrames, Still]
+    assert [type(layer) for layer in layers(env)] == kinds
+    shown = [env.reset(seed=0)[0]["partial"], *(env.step(ACTION)[0]["partial"] for _ in range(9))]
+    assert np.abs(shown[0] - [0, 1, 0, 1]).max() > 1e-3
+    np.testing.assert_array_equal(shown, [shown[0]] * 10, "a value that is shown again has the same noise")
+
+
+def test_a_memory_of_another_entry_is_none_of_the_sensors():
+    env = disturb(SensorNoise(History(Still(PAIR), 2, key="privileged"), 0.5), drop=1.0)
+    assert [type(layer) for layer in layers(env)] == [DroppedFrames, SensorNoise, History, Still]
+    shown = _seen(env, 5)
+    np.testing.assert_array_equal(shown, [shown[0]] * 6, "a value that is shown again has the same noise")
+    other = disturb(AppendDesiredGoal(SensorNoise(Still(GOALS), 0.5)), drop=1.0, key="privileged")
+    assert [type(layer) for layer in layers(other)] == [DroppedFrames, AppendDesiredGoal, SensorNoise, Still]
+
+
+def test_added_noise_and_losses_are_independent_of_those_further_out():
+    space = spaces.Dict(partial=spaces.Box(-9, 9, (2,)), privileged=spaces.Box(-9, 9, (2,)))
+    env = disturb(SensorNoise(History(Still(space), 1), 0.5, key="privileged"), noise_std=0.5)
+    env.reset(seed=0)
+    noise = np.stack([np.stack(list(env.step(ACTION)[0].values())) for _ in range(400)]) - [0, 1]
+    assert abs(np.corrcoef(noise[:, 0, 0], noise[:, 1, 0])[0, 1]) < 4 / np.sqrt(400)
+    counting = disturb(DroppedFrames(History(Counting(), 1), 0.5, key="privileged"), drop=0.5)
+    seen = [counting.reset(seed=0)[0], *(counting.step(ACTION)[0] for _ in range(400))]
+    lost = [np.diff([values[key][0] for values in seen]) == 0 for key in ("partial", "privileged")]
+    assert abs(np.corrcoef(*lost)[0, 1]) < 4 / np.sqrt(400)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "said"),
+    [
+        (
+            lambda: SensorNoise(History(Still(PAIR), 3), 0.1),
+            r"SensorNoise stands outside of History.*History\(SensorNoise\(env",
+        ),
+        (lambda: SensorNoise(SensorDelay(Still(PAIR), 3), 0.1), "SensorNoise stands outside of SensorDelay"),
+        (lambda: SensorNoise(DroppedFrames(Still(PAIR), 0.1), 0.1), "SensorNoise stands outside of DroppedFrames"),
+        (
+            lambda: SensorDelay(gym.wrappers.TimeLimit(PreviousAction(Still(PAIR)), 9), 2),
+            "SensorDelay stands outside of Previous",
+        ),
+        (lambda: DroppedFrames(History(Still(PAIR), 2), 0.1), 'DroppedFrames stands outside of History.*"partial"'),
+        (lambda: SensorNoise(AppendDesiredGoal(Still(GOALS)), 0.1), "SensorNoise stands outside of AppendDesiredGoal"),
+    ],
+)
+def test_another_order_than_that_of_a_robot_warns(wrap, said):
+    with pytest.warns(UserWarning, match=said):
+        wrap()
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_order_of_a_robot_and_wrappers_of_other_entries_do_not_warn():
+    env = DroppedFrames(SensorDelay(SensorNoise(SensorNoise(Still(GOALS), 0.1), 0.1), 1), 0.1)
+    PreviousAction(History(AppendDesiredGoal(SensorDelay(env, 1)), 2))
+    SensorNoise(History(SensorDelay(Still(PAIR), 1, key="privileged"), 2, key="privileged"), 0.1)
+    SensorNoise(AppendDesiredGoal(Still(GOALS)), 0.1, key="privileged")
 
 
 def test_a_goal_is_no_measurement():

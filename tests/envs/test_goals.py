@@ -70,6 +70,14 @@ def test_by_default_partial_alone_gets_it_once_whatever_its_history():
     np.testing.assert_array_equal(observation["partial"][-2:], np.float32(seen[-1]["desired_goal"].ravel()))
 
 
+def test_an_entry_of_double_precision_keeps_it():
+    doubles = {key: spaces.Box(-1, 1, (2,), np.float64) for key in ("partial", "privileged", *GOALS)}
+    env = AppendDesiredGoal(Sampled(spaces.Dict(doubles)))
+    for observation in _both_ends(env):
+        assert observation in env.observation_space
+        assert observation["partial"].dtype == env.observation_space["partial"].dtype == np.float64
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -78,7 +86,11 @@ def test_by_default_partial_alone_gets_it_once_whatever_its_history():
         (lambda: _split(["goal"]), 'no entry "goal"'),
         (lambda: AppendDesiredGoal(_split(())[0]), 'no entry "desired_goal"'),
         (lambda: AppendDesiredGoal(_split()[0], ["state"]), 'no entry "state"'),
+        (lambda: _split(None), "keep must be a list of keys"),
         (lambda: AppendDesiredGoal(_split()[0], "partial"), "to must be a list of keys"),
+        (lambda: AppendDesiredGoal(_split()[0], None), "to must be a list of keys"),
+        (lambda: AppendDesiredGoal(_split([*GOALS, "camera"])[0], ["camera"]), 'floating-point entry "camera"'),
+        (lambda: AppendDesiredGoal(Sampled(SPACE), ["achieved_goal"]), 'one-dimensional.*"achieved_goal"'),
     ],
 )
 def test_refuses_with_the_culprit_named(make, message):

@@ -121,6 +121,39 @@ def test_actions_without_bounds_get_one_and_are_kept_within():
     assert GroupsVecEnv(Simulator(bound=0.3)).action_space == spaces.Box(np.float32(-0.3), np.float32(0.3), (1,))
 
 
+class Seeing(Simulator):
+    """A simulator whose first group is a camera's image, in bytes."""
+
+    def __init__(self, action_space):
+        super().__init__()
+        image = {"image": spaces.Box(0, 255, (3,), np.uint8)}
+        self.single_observation_space = spaces.Dict({**image, **self.single_observation_space.spaces})
+        self.single_action_space = action_space
+
+    def step(self, action):
+        self.taken.append(action.clone())
+        nothing = th.zeros(self.num_envs)
+        return self._observe(), nothing, nothing > 0, nothing > 0, {}
+
+    def _observe(self):
+        return {"image": th.zeros(self.num_envs, 3, dtype=th.uint8), **super()._observe()}
+
+
+@pytest.mark.parametrize(
+    ("space", "actions", "dtype"),
+    [
+        (spaces.Box(-1.0, 1.0, (1,)), np.array([[-0.5], [0.25], [0.75], [1.0]]), th.float32),
+        (spaces.Discrete(3), np.array([0, 1, 2, 1]), th.int64),
+    ],
+)
+def test_actions_are_of_their_own_type_whatever_that_of_the_observations(space, actions, dtype):
+    env = GroupsVecEnv(Seeing(space))
+    env.reset()
+    env.step(actions)
+    assert env.simulator.taken[0].dtype == dtype
+    assert env.simulator.taken[0].tolist() == actions.tolist()
+
+
 def test_noise_is_on_partial_alone_and_selections_take_indices():
     env = GroupsVecEnv(Simulator(), partial={"policy": [1]}, privileged=["critic", "policy"], noise_std=0.1)
     env.seed(0)
@@ -144,11 +177,36 @@ def test_closing_closes_the_simulator():
     assert env.simulator.is_closed
 
 
+class Plain:
+    """A simulator that is none of gymnasium's environments, and has no more than it needs."""
+
+    def __init__(self):
+        inner = Simulator(n_envs=2)
+        self.num_envs, self.reset, self.step = inner.num_envs, inner.reset, inner.step
+        self.single_observation_space, self.single_action_space = inner.single_observation_space, inner.single_action_space
+
+
+def test_a_simulator_needs_no_more_than_is_said():
+    env = GroupsVecEnv(Plain())
+    env.reset()
+    assert env.step(np.zeros((2, 1)))[0]["partial"].tolist() == [[0, 1], [1, 1]]
+    env.close()
+
+
+def test_a_simulator_that_has_less_is_told():
+    simulator = Plain()
+    del simulator.single_action_space, simulator.step
+    with pytest.raises(ValueError, match=r"simulator must have num_envs, .* lacks single_action_space, step"):
+        GroupsVecEnv(simulator)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"max_action": np.inf}, "max_action must be a finite number above 0"),
         ({"max_action": 0.0}, "max_action"),
+        ({"max_action": "1"}, "max_action must be a finite number above 0, got '1'"),
+        ({"max_action": [1.0]}, "max_action must be a finite number above 0"),
         ({"partial": ["actor"]}, 'no entry "actor"'),
         ({"privileged": []}, "privileged must be"),
         ({"noise_std": -1.0}, "noise_std"),

@@ -12,9 +12,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from sb3_gac.envs import CameraImage, NoRenderingError, make_pixels
+from sb3_gac.envs import CameraImage, NoRenderingError, SplitObservation, make_pixels
 from sb3_gac.envs.camera import make_renderer
-from sb3_gac.envs.state import env_state, restore_env_state
+from sb3_gac.envs.state import env_state, layers, restore_env_state
 from sb3_gac.envs.suites.pixels import TASKS
 from tests.envs.rendering import needs_rendering
 
@@ -77,6 +77,30 @@ def test_an_image_is_what_the_camera_sees_right_way_up():
     other = _make(frames=1, size=48)
     np.testing.assert_array_equal(image, other.reset(seed=0)[0]["partial"])
     env.close()
+
+
+@pytest.mark.usefixtures("_rendering")
+def test_an_image_shows_what_the_environment_has_changed_in_its_model():
+    env = _make(frames=1)
+    plain, model = env.reset(seed=0)[0]["partial"], env.unwrapped.model
+    for name, value in {"geom_rgba": [1, 0, 0, 1], "light_diffuse": 0.1, "geom_size": 0.2}.items():
+        before = getattr(model, name).copy()
+        getattr(model, name)[:] = value
+        assert np.abs(env.reset(seed=0)[0]["partial"].astype(float) - plain).mean() > 1, name
+        getattr(model, name)[:] = before
+        np.testing.assert_array_equal(env.reset(seed=0)[0]["partial"], plain)
+    env.close()
+
+
+@pytest.mark.usefixtures("_rendering")
+def test_an_image_shows_another_robot_once_the_environment_has_it():
+    env, walker = _make("Hopper", frames=1), _make("Walker2d", frames=1)
+    env.reset(seed=0)
+    expected = walker.reset(seed=0)[0]["partial"]
+    env.unwrapped.model, env.unwrapped.data = walker.unwrapped.model, walker.unwrapped.data
+    camera = next(layer for layer in layers(env) if isinstance(layer, CameraImage))
+    np.testing.assert_array_equal(camera._image(), expected)
+    walker.close()
 
 
 @pytest.mark.usefixtures("_rendering")
@@ -170,14 +194,22 @@ def test_where_mujoco_itself_fails_for_want_of_opengl(monkeypatch):
         ({"task": "Pusher"}, "task must be one of .*HalfCheetah"),
         ({"noise_std": 0.1}, "noise_std must be 0 for images, got 0.1"),
         ({"camera": "front"}, r"camera must be one of \['track'\], got 'front'"),
-        ({"size": 0}, "size must be at least 1"),
-        ({"frames": 0}, "length must be at least 1"),
+        ({"size": 0}, "size must be an integer of at least 1"),
+        ({"size": 64.5}, "size must be an integer of at least 1, in pixels, got 64.5"),
+        ({"frames": 0}, "frames must be an integer of at least 1, got 0"),
+        ({"frames": 2.5}, "frames must be an integer of at least 1, got 2.5"),
         ({"privileged": "everything"}, "privileged must be one of"),
     ],
 )
 def test_refuses_with_the_culprit_named(kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_pixels(**{"task": "HalfCheetah", **kwargs})
+
+
+def test_a_model_without_a_camera_is_told():
+    env = SplitObservation(gym.make("Reacher-v5"), [0], [1])
+    with pytest.raises(ValueError, match=r"camera='track', but the model of .* has no camera: add one to its XML file"):
+        CameraImage(env)
 
 
 def test_other_simulators_have_no_camera():

@@ -6,6 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_gac.envs import History, PreviousAction, SensorNoise, SplitObservation
@@ -64,6 +65,18 @@ def test_another_environment_goes_on_to_the_bit(name):
     assert other.episode_returns == env.episode_returns
 
 
+def test_a_state_can_be_restored_again_and_again():
+    env = Monitor(MAKERS["late and lost"]())
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(60)]
+    env.reset(seed=3)
+    state, seen = env_state(env), []
+    for _ in range(2):
+        restore_env_state(env, state)
+        seen.append((_go_on(env, actions), list(env.episode_returns)))
+    np.testing.assert_equal(seen[0], seen[1])
+
+
 @pytest.mark.parametrize("name", MAKERS)
 def test_an_environment_that_was_never_reset_takes_a_state_from_before_the_first_step(name):
     env, other = MAKERS[name](), MAKERS[name]()
@@ -109,6 +122,45 @@ def test_what_a_plugin_has_in_memory_stays_with_its_own_environment():
     restore_env_state(other, env_state(env))
     assert other.data.plugin_data == address
     np.testing.assert_array_equal(other.data.qpos, env.data.qpos)
+
+
+def _drawing(change):
+    """An environment whose reset draws a part of MuJoCo's model."""
+
+    class Drawing(HopperEnv):
+        def reset_model(self):
+            change(self.model, self.np_random.uniform(0.2, 1.0))
+            return super().reset_model()
+
+    return Drawing()
+
+
+def _set(array, value):
+    array[:] = value
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda model, drawn: _set(model.opt.gravity, [0, 0, -10 * drawn]),
+        lambda model, drawn: setattr(model.opt, "viscosity", 100 * drawn),
+        lambda model, drawn: setattr(model.opt, "timestep", 0.002 * drawn),
+        lambda model, drawn: _set(model.geom_friction, drawn),
+        lambda model, drawn: _set(model.qpos_spring, drawn),
+        lambda model, drawn: _set(model.geom_rgba, drawn),
+        lambda model, drawn: _set(model.light_diffuse, drawn),
+    ],
+    ids=["gravity", "viscosity", "time step", "friction", "springs", "colours", "lights"],
+)
+def test_what_a_reset_draws_of_the_model_is_restored(change):
+    env, other = _drawing(change), _drawing(change)
+    env.reset(seed=1)
+    other.reset(seed=7)
+    restore_env_state(other, env_state(env))
+    for name in ("geom_rgba", "light_diffuse"):
+        np.testing.assert_array_equal(getattr(other.model, name), getattr(env.model, name))
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    np.testing.assert_equal(_go_on(other, actions), _go_on(env, actions))
 
 
 class _Unknown(gym.Wrapper):

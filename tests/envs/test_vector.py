@@ -70,6 +70,23 @@ def test_episodes_end_where_the_simulator_or_the_limit_ends_them():
     assert infos[0]["episode"]["l"] == 3, "lengths are counted anew"
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32])
+def test_a_simulator_may_tell_ends_by_numbers(dtype):
+    class Telling(Counters):
+        def advance(self, actions):
+            step = super().advance(actions)
+            return step._replace(terminated=step.terminated.astype(dtype), truncated=np.array([0, 0, 1], dtype))
+
+    env = Telling(3)
+    env.seed(7)
+    env.reset()
+    for _ in range(3):
+        *_, dones, infos = env.step(NO_ACTION)
+    assert dones.dtype == bool
+    assert dones.tolist() == [True, False, True]
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, False, True], "a fall is none of the time limit"
+
+
 def test_noise_is_drawn_once_for_each_observation_and_leaves_the_simulator_alone():
     (clean, first), (noisy, first_noisy) = _started(time_limit=3), _started(time_limit=3, noise_std=0.5)
     assert (first["partial"] != first_noisy["partial"]).all()
@@ -84,6 +101,17 @@ def test_noise_is_drawn_once_for_each_observation_and_leaves_the_simulator_alone
             noise_of_next = (observation["partial"] - plain["partial"])[index]
             assert (noise_of_last != 0).all()
             assert (noise_of_last != noise_of_next).all()
+
+
+def test_another_noise_std_counts_from_the_next_step_on():
+    env, first = _started(partial=["steps"])
+    assert not first["partial"].any()
+    env.set_attr("noise_std", 0.5)
+    assert (env.step(NO_ACTION)[0]["partial"] != 1).all()
+    env.set_attr("noise_std", 0.0)
+    assert (env.step(NO_ACTION)[0]["partial"] == 2).all()
+    with pytest.raises(ValueError, match="noise_std must be a finite number >= 0"):
+        env.set_attr("noise_std", -1.0)
 
 
 def test_noise_is_gaussian_of_the_given_size_and_independent():
@@ -163,6 +191,7 @@ def test_a_monitor_around_it_counts_the_same():
     ("wrong", "message"),
     [
         ({"n_envs": 0}, "n_envs must be"),
+        ({"n_envs": True}, "n_envs must be"),
         ({"time_limit": 2.5}, "time_limit must be"),
         ({"noise_std": -1.0}, "noise_std must be"),
         ({"noise_std": [1.0] * 5}, "noise_std must be a number or have the entry's shape"),
@@ -183,6 +212,7 @@ def test_what_it_cannot_do_is_said():
     env.set_options({"goal": 1})
     with pytest.raises(ValueError, match=r"Counters takes no reset options, got .*goal"):
         env.reset()
+    assert env.reset()["privileged"][0, 0] == 0, "the options were of that reset alone"
     with pytest.raises(ValueError, match="vec_env must be of one environment, got 2"):
         SingleEnv(Counters(2))
     with pytest.raises(ValueError, match="must be of a suite whose simulator steps a batch, got 'sb3_gac/Pendulum-v1'"):
@@ -197,6 +227,10 @@ def test_an_id_makes_the_suites_own_and_one_of_them():
     assert (env.num_envs, env.time_limit, float(env.noise_std)) == (2, 5, 0.5)
     assert (env.reset()["privileged"] == _started(n_envs=2)[1]["privileged"]).all()
     assert make_vec("sb3_gac/Counters-v0", time_limit=2).time_limit == 2
+    assert make_vec("sb3_gac/Counters-v0", history=1, delay=0, drop=0.0).num_envs == 1, "none of them is asked for"
+    for make in (make_vec, gym.make):
+        with pytest.raises(ValueError, match=r"history is for environments that are stepped one at a time.*Counters"):
+            make("sb3_gac/Counters-v0", history=4)
     single = gym.make("sb3_gac/Counters-v0", noise_std=0.1)
     check_env(single.unwrapped, skip_render_check=True)
     sb3_check_env(single.unwrapped, warn=False)
@@ -209,6 +243,12 @@ def test_other_ids_are_made_by_sb3():
     assert env.get_attr("noise_std")[0] == 0.5
     expected = gym.make("sb3_gac/Pendulum-v1").reset(seed=3)[0]["privileged"]
     assert (env.reset()["privileged"][0] == expected).all()
+
+
+@pytest.mark.parametrize("n_envs", [0, -1, 2.5, "2", None])
+def test_a_number_of_environments_that_is_none_is_named(n_envs):
+    with pytest.raises(ValueError, match="n_envs must be an integer of at least 1, got"):
+        make_vec("sb3_gac/Pendulum-v1", n_envs)
 
 
 def test_one_environment_ends_and_begins_as_gymnasium_has_it():
@@ -258,6 +298,20 @@ def test_a_checkpoint_goes_on_to_the_bit_where_the_simulator_can_be_put_back(mak
     resumed.learn(20, reset_num_timesteps=False)
     pairs = zip(model.policy.parameters(), resumed.policy.parameters(), strict=True)
     assert all((a == b).all() for a, b in pairs)
+
+
+def test_a_state_can_be_restored_again_and_again():
+    env = RestorableCounters(3, time_limit=4, noise_std=0.1)
+    env.seed(7)
+    env.reset()
+    env.step(NO_ACTION)
+    state, seen = env.checkpoint_state(), []
+    for _ in range(2):
+        env.restore_checkpoint_state(state)
+        steps = [env.step(NO_ACTION) for _ in range(4)]
+        returns = [[info["episode"]["r"] for info in infos if "episode" in info] for *_, infos in steps]
+        seen.append(([observation["partial"].tolist() for observation, *_ in steps], returns))
+    assert seen[0] == seen[1]
 
 
 def test_where_it_cannot_be_a_checkpoint_says_so(tmp_path):

@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecTransposeImage
 
 from sb3_gac.envs import (
     DroppedFrames,
@@ -30,6 +31,7 @@ def _box(*shape, dtype=np.float32):
 FLAT = _box(6, dtype=np.float64)
 PAIR = spaces.Dict(partial=_box(2), privileged=_box(3))
 IMAGE = spaces.Dict(partial=_box(1, 36, 36, dtype=np.uint8), privileged=_box(3))
+NUMBER = spaces.Dict(partial=_box(), privileged=_box())
 GOAL = spaces.Dict(
     achieved_goal=_box(2, dtype=np.float64), desired_goal=_box(2, dtype=np.float64), observation=_box(6, dtype=np.float64)
 )
@@ -109,7 +111,7 @@ CHAINS = {
     "history": (PAIR, lambda env: History(env, 3)),
     "history of images": (IMAGE, lambda env: History(env, 3)),
     "split, noise, history": (FLAT, lambda env: History(SensorNoise(_split(env), 0.1), 3, actions=True)),
-    "split, history, noise": (FLAT, lambda env: SensorNoise(History(_split(env), 3, actions=True), 0.1)),
+    "split, history, noise": (FLAT, lambda env: SensorNoise(History(_split(env), 3, key="privileged"), 0.1)),
     "history, history": (PAIR, lambda env: History(History(env, 2, actions=True), 2)),
     "delay": (PAIR, lambda env: SensorDelay(env, 2)),
     "delay of images": (IMAGE, lambda env: SensorDelay(env, 1)),
@@ -280,6 +282,12 @@ def test_noise_keeps_a_float64_entry_float64():
     assert env.observation_space["partial"].dtype == env.reset(seed=0)[0]["partial"].dtype == np.float64
 
 
+def test_noise_on_a_number_gives_an_array():
+    env = SensorNoise(Strict(NUMBER), 0.1)
+    assert isinstance(env.reset(seed=0)[0]["partial"], np.ndarray)
+    assert env.step(NO_ACTION)[0]["partial"].shape == ()
+
+
 def test_noise_does_not_write_into_the_observation_it_was_given():
     env = SensorNoise(Strict(PAIR), 0.5)
     observation, _ = env.reset(seed=0)
@@ -302,6 +310,29 @@ def test_noise_repeats_with_its_seed_and_differs_between_seeds():
     assert len({row.tobytes() for seed in (0, 2, 3) for row in draws[seed]}) == 3 * 4
     env = SensorNoise(Still(PAIR), 0.1)
     assert np.array_equal(_noise(env, 4, seed=1), _noise(env, 4, seed=1))  # also where it had been used before
+
+
+def test_noise_of_a_large_entry_takes_little_memory():
+    image = spaces.Dict(partial=_box(3, 84, 84))
+    env = SensorNoise(Strict(image), 0.1)
+    clean, drawn = Strict(image), np.random.default_rng([0, 0x6E6F697365])
+    for seed in (0, None, None, None, None):
+        noise = drawn.standard_normal((3, 84, 84), dtype=np.float32) * np.float32(0.1)
+        given = {} if seed is None else {"seed": seed}
+        np.testing.assert_array_equal(env.reset(**given)[0]["partial"], clean.reset(**given)[0]["partial"] + noise)
+    assert len(pickle.dumps(env)) < 2e6
+
+
+def test_another_noise_std_counts_from_the_next_step_on():
+    env = gym.wrappers.TimeLimit(SensorNoise(Still(PAIR), 0.5), 10)
+    env.reset(seed=0)
+    assert env.step(NO_ACTION)[0]["partial"][0] != 0
+    env.set_wrapper_attr("noise_std", [0.0, 0.5])
+    seen = env.step(NO_ACTION)[0]["partial"]
+    assert seen[0] == 0
+    assert seen[1] != 1
+    with pytest.raises(ValueError, match="noise_std must be a finite number >= 0"):
+        env.set_wrapper_attr("noise_std", -1.0)
 
 
 def test_noise_goes_on_after_a_reset_without_a_seed():
@@ -381,6 +412,18 @@ def test_history_of_images_joins_them_along_the_first_axis():
     assert image.tolist() == [[[0, 1]], [[2, 3]], [[10, 11]], [[12, 13]], [[20, 21]], [[22, 23]]]
 
 
+def test_history_of_images_with_channels_last_is_what_sb3_stacks():
+    space = spaces.Dict(partial=_box(8, 9, 3, dtype=np.uint8))
+    ours = VecTransposeImage(DummyVecEnv([lambda: History(Strict(space), 2)]))
+    stacked = VecTransposeImage(VecFrameStack(DummyVecEnv([lambda: Strict(space)]), 2))
+    assert ours.observation_space == stacked.observation_space == spaces.Dict(partial=_box(6, 8, 9, dtype=np.uint8))
+    ours.reset()
+    stacked.reset()
+    for _ in range(3):
+        seen, expected = (env.step(NO_ACTION[None])[0]["partial"] for env in (ours, stacked))
+        np.testing.assert_array_equal(seen, expected)
+
+
 def test_history_of_the_privileged_entry_leaves_partial_alone():
     env = History(Strict(PAIR), 2, key="privileged")
     env.reset(seed=0)
@@ -442,6 +485,13 @@ REFUSED = {
     "noise, integers": (INTEGERS, lambda env: SensorNoise(env, 0.1), 'floating-point entry, but "partial"'),
     "noise, no box": (NO_BOX, lambda env: SensorNoise(env, 0.1), '"partial" must be a Box'),
     "noise, no dict": (FLAT, lambda env: SensorNoise(env, 0.1), 'no entry "partial"'),
+    "noise, a word": (PAIR, lambda env: SensorNoise(env, "much"), "noise_std must be .*'much'"),
+    "noise, a mapping": (PAIR, lambda env: SensorNoise(env, {"partial": 0.1}), "noise_std must be"),
+    "noise, uneven lists": (PAIR, lambda env: SensorNoise(env, [[0.1], [0.1, 0.2]]), "noise_std must be"),
+    "split, a number": (FLAT, lambda env: SplitObservation(env, 3, [0]), "partial must be .* got 3"),
+    "split, none": (FLAT, lambda env: SplitObservation(env, [0], None), "privileged must be .* got None"),
+    "split, uneven lists": (FLAT, lambda env: SplitObservation(env, [[0], [0, 1]], [0]), "partial must be"),
+    "split, used up": (FLAT, lambda env: SplitObservation(env, (i for i in (0, 9)), [0]), r"partial must be .*\[0, 9\]"),
     "split, empty": (FLAT, lambda env: SplitObservation(env, [], [0]), "partial must be"),
     "split, negative index": (FLAT, lambda env: SplitObservation(env, [0], [-1]), "privileged must be .* 0..5"),
     "split, index too large": (FLAT, lambda env: SplitObservation(env, [0, 6], [0]), "partial must be .* 0..5"),
@@ -455,6 +505,13 @@ REFUSED = {
     "split dict, unknown": (GOAL, lambda env: SplitDictObservation(env, ["joints"], ["observation"]), '"joints"'),
     "split dict, empty": (GOAL, lambda env: SplitDictObservation(env, ["observation"], []), "privileged must be"),
     "split dict, string": (GOAL, lambda env: SplitDictObservation(env, "observation", ["observation"]), "partial must be"),
+    "split dict, a number": (GOAL, lambda env: SplitDictObservation(env, 3, ["observation"]), "partial must be .* got 3"),
+    "split dict, a set": (GOAL, lambda env: SplitDictObservation(env, {"observation"}, ["observation"]), "partial must be"),
+    "split dict, an index": (
+        GOAL,
+        lambda env: SplitDictObservation(env, ["observation"], {"observation": 0}),
+        r'privileged\["observation"\] must be .* got 0',
+    ),
     "split dict, no box": (NO_BOX, lambda env: SplitDictObservation(env, ["partial"], ["privileged"]), '"partial" must be'),
     "split dict, bad index": (
         GOAL,
@@ -463,6 +520,9 @@ REFUSED = {
     ),
     "history, length 0": (PAIR, lambda env: History(env, 0), "length"),
     "history, length -1": (PAIR, lambda env: History(env, -1), "length"),
+    "history, length 2.5": (PAIR, lambda env: History(env, 2.5), "length must be an integer .* got 2.5"),
+    "history, length '2'": (PAIR, lambda env: History(env, "2"), "length must be an integer .* got '2'"),
+    "history, length True": (PAIR, lambda env: History(env, True), "length must be an integer .* got True"),
     "history, unknown key": (PAIR, lambda env: History(env, 2, key="joints"), '"joints"'),
     "history, no box": (NO_BOX, lambda env: History(env, 2), '"partial" must be a Box'),
     "history, scalar": (SCALAR, lambda env: History(env, 2), "at least one axis"),
@@ -475,6 +535,11 @@ REFUSED = {
 def test_refuses_with_the_culprit_named(space, wrap, message):
     with pytest.raises(ValueError, match=message):
         wrap(Strict(space))
+
+
+def test_keys_and_lengths_of_numpys_types_are_taken():
+    env = SplitDictObservation(Strict(GOAL), np.array(["observation", "desired_goal"]), np.array(["achieved_goal"]))
+    assert History(env, np.int64(2)).observation_space["partial"].shape == (2 * (6 + 2),)
 
 
 def test_history_refuses_to_append_discrete_actions():

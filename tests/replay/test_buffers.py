@@ -453,9 +453,16 @@ def test_counted_entries_are_not_stored_in_float16():
     np.testing.assert_array_equal(buffer.observations["gear"][0].ravel(), [3, 1])
 
 
-def test_a_storage_dtype_that_is_none():
-    with pytest.raises(ValueError, match='storage_dtype must be a floating-point type such as "float16", or None, got "int8"'):
-        CompactDictReplayBuffer(20, ODD_SPACE, spaces.Box(-1, 1, (1,)), "cpu", storage_dtype="int8")
+@pytest.mark.parametrize("given", ["int8", "flaot16"])
+def test_a_storage_dtype_that_is_none(given):
+    said = f'storage_dtype must be a floating-point type such as "float16", or None, got "{given}"'
+    with pytest.raises(ValueError, match=said):
+        CompactDictReplayBuffer(20, ODD_SPACE, spaces.Box(-1, 1, (1,)), "cpu", storage_dtype=given)
+
+
+def test_a_number_of_steps_that_is_none():
+    with pytest.raises(ValueError, match=r"n_steps must be an integer >= 1, got 3\.0"):
+        _make(20, 1, n_steps=3.0)
 
 
 @pytest.mark.parametrize("kind", [CompactDictReplayBuffer, EpisodeReplayBuffer])

@@ -185,9 +185,12 @@ def test_reset_forgets_episodes():
     ("kwargs", "message"),
     [
         ({"n_steps": 3}, "n_steps must be 1"),
-        ({"sequence_length": 0}, "sequence_length must be at least 1"),
-        ({"burn_in": 2}, "burn_in must be at least 0, and goes with a sequence_length"),
-        ({"sequence_length": 4, "burn_in": -1}, "burn_in must be at least 0"),
+        ({"sequence_length": 0}, "sequence_length must be an integer >= 1, or None for whole episodes, got 0"),
+        ({"sequence_length": 4.0}, r"sequence_length must be an integer .* got 4\.0"),
+        ({"sequence_length": "4"}, "sequence_length must be an integer .* got '4'"),
+        ({"burn_in": 2}, "burn_in goes with a sequence_length"),
+        ({"sequence_length": 4, "burn_in": -1}, "burn_in must be an integer >= 0, got -1"),
+        ({"sequence_length": 4, "burn_in": 1.0}, r"burn_in must be an integer >= 0, got 1\.0"),
     ],
 )
 def test_bad_arguments(kwargs, message):

@@ -227,6 +227,8 @@ def test_float16_storage_of_stacks():
         ({"partial": 0}, r'frame_stacks\["partial"\] must be an integer'),
         ({"partial": 1.5}, r'frame_stacks\["partial"\] must be an integer'),
         ({"partial": 128}, r'frame_stacks\["partial"\] must be an integer'),
+        (3, "frame_stacks must be a mapping from entries to their numbers of frames, got 3"),
+        (["partial"], "frame_stacks must be a mapping"),
         ({"phase": 1}, r'frame_stacks\["phase"\] is 1 frames, .* Discrete'),
     ],
 )

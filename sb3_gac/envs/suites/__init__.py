@@ -81,6 +81,8 @@ class Suite(NamedTuple):
 _NAMESPACE = "sb3_gac/"
 #: Arguments of an environment that are for this package, not for gymnasium
 _OWN = ("vec_entry_point", "shapes", "whole_state")
+#: Arguments of environments that are stepped one at a time -> value that changes nothing
+_ONE_AT_A_TIME: dict[str, Any] = {"history": 1, "delay": 0, "drop": 0.0}
 _SINGLE = "sb3_gac.envs.vector.single:make_single"
 
 SUITES = {
@@ -210,6 +212,25 @@ def batch_factory(env_id: str) -> tuple[Callable[..., Any], dict[str, Any]]:
     arguments = SUITES[suite_of(env_id) or ""].environments[without_module(env_id)]
     module, _, function = arguments["vec_entry_point"].partition(":")
     return getattr(import_module(module), function), dict(arguments.get("kwargs", {}))
+
+
+def make_batch(env_id: str, n_envs: int, **kwargs: Any) -> Any:
+    """
+    Make an environment's vectorised form.
+
+    :param env_id: id of an environment for which :func:`is_batched` is true
+    :param n_envs: number of environments
+    :param kwargs: keyword arguments of the environment
+    :return: vectorised environments
+    :raises ValueError: if a history, delays or losses are asked for, which such environments do not have
+    """
+    factory, of_task = batch_factory(env_id)
+    for name, none in _ONE_AT_A_TIME.items():
+        if kwargs.pop(name, none) != none:
+            raise ValueError(
+                f"{name} is for environments that are stepped one at a time, and {env_id} is one simulator of many."
+            )
+    return factory(n_envs=n_envs, **of_task | kwargs)
 
 
 def task_of(env_id: str) -> str:

@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.disturbances import delayed_and_dropped
 from sb3_gac.envs.wrappers import History, SensorNoise, SplitObservation
 
@@ -95,7 +96,6 @@ def noisy_with_history(env: gym.Env, noise_std: float, history: int = 1, delay: 
     :raises ValueError: if ``noise_std`` is negative, ``history`` no positive integer, ``delay`` no integer of at least 0, or
         ``drop`` no probability
     """
-    if not isinstance(history, int) or isinstance(history, bool) or history < 1:
-        raise ValueError(f"history must be an integer of at least 1, got {history!r}.")
+    history = check_count("history", history)
     arriving = delayed_and_dropped(SensorNoise(env, noise_std), delay, drop)
     return arriving if history == 1 else History(arriving, history, actions=True)

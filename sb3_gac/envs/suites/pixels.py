@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.camera import CameraImage, no_rendering
 from sb3_gac.envs.disturbances import delayed_and_dropped
 from sb3_gac.envs.suites.mujoco import make_mujoco
@@ -52,6 +53,7 @@ def make_pixels(
             f"noise_std must be 0 for images, got {noise_std!r}: it is in the units of positions, and noise that is drawn for "
             "each pixel by itself hides nothing from an encoder, which averages over many."
         )
+    frames = check_count("frames", frames)
     try:
         import mujoco  # noqa: F401  # looks for OpenGL at once, where MUJOCO_GL says of which kind
     except Exception as error:

@@ -13,6 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
 from sb3_gac.envs.selections import BatchSelection, Indices, KeySelection
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
@@ -76,24 +77,33 @@ class BatchVecEnv(VecEnv):
         time_limit: int | None = None,
         noise_std: float | Sequence[float] = 0.0,
     ):
-        for name, value in {"n_envs": n_envs, "time_limit": 1 if time_limit is None else time_limit}.items():
-            if not isinstance(value, (int, np.integer)) or value < 1:
-                raise ValueError(f"{name} must be a whole number above 0, got {value!r}.")
+        n_envs = check_count("n_envs", n_envs)
+        time_limit = None if time_limit is None else check_count("time_limit", time_limit)
         self._partial = BatchSelection(PARTIAL, partial, observation_space)
         self._privileged = BatchSelection(PRIVILEGED, privileged, observation_space)
-        self.time_limit, self.noise_std = time_limit, check_noise_std(noise_std, self._partial.space, PARTIAL)
+        self.time_limit, self.noise_std = time_limit, noise_std
         noisy = noisy_box(self._partial.space, self.noise_std)
         space = spaces.Dict({PARTIAL: noisy, PRIVILEGED: self._privileged.space})
-        super().__init__(int(n_envs), space, _in_float32(action_space))
+        super().__init__(n_envs, space, _in_float32(action_space))
         actions = self.action_space
         self._bounds = (actions.low, actions.high) if isinstance(actions, spaces.Box) else None
-        self._is_noisy, self._noise = bool((self.noise_std > 0).any()), np.random.default_rng()
+        self._noise = np.random.default_rng()
         #: Steps so far, the step at which each episode began, and the first of these: no array is touched before an episode
         #: may have reached its time limit
         self._n_steps, self._begun, self._first_begun = 0, np.zeros(self.num_envs, dtype=np.int64), 0
         self._returns = np.zeros(self.num_envs)
         self._has_started, self._created = False, time.time()
         self._actions: np.ndarray | None = None
+
+    @property
+    def noise_std(self) -> np.ndarray:
+        """Standard deviation of the noise from the next step on; the bounds of the space are those of the first one."""
+        return self._noise_std
+
+    @noise_std.setter
+    def noise_std(self, noise_std: float | Sequence[float]) -> None:
+        self._noise_std = check_noise_std(noise_std, self._partial.space, PARTIAL)
+        self._is_noisy = bool((self._noise_std > 0).any())
 
     # --- interface to the simulator ---------------------------------------------------------------------------------
 
@@ -151,10 +161,11 @@ class BatchVecEnv(VecEnv):
         Begin new episodes in all environments.
 
         :return: first observations of new episodes, seeded if :meth:`seed` was called since the last reset
-        :raises ValueError: if :meth:`set_options` was given options, which this class does not take
+        :raises ValueError: if :meth:`set_options` was given options, which this class does not take; the next reset is without
         """
-        if any(self._options):
-            raise ValueError(f"{type(self).__name__} takes no reset options, got {self._options}: do not call set_options().")
+        if any(options := self._options):
+            self._reset_options()  # or the next reset would be refused as well
+            raise ValueError(f"{type(self).__name__} takes no reset options, got {options}: leave them out.")
         if not self._has_started and self._seeds[0] is None:
             self.seed()
         if self._seeds[0] is None:
@@ -188,6 +199,8 @@ class BatchVecEnv(VecEnv):
         """
         assert self._actions is not None
         raw, rewards, terminated, truncated, values = self.advance(self._actions)
+        # Of the numbers 0 and 1, which a simulator may tell ends by, ~ is true
+        terminated, truncated = np.asarray(terminated, dtype=bool), np.asarray(truncated, dtype=bool)
         self._n_steps += 1
         self._returns += rewards
         if self.time_limit is not None and self._n_steps - self._first_begun >= self.time_limit:
@@ -295,9 +308,10 @@ class BatchVecEnv(VecEnv):
         """
         Put the environments back into a state.
 
-        :param state: state that :meth:`checkpoint_state` returned
+        :param state: state that :meth:`checkpoint_state` returned, which may be restored again later
         :raises NotRestorableError: if the simulator can't be put back
         """
+        state = deepcopy(state)  # the next steps write into arrays and generators
         self.restore_simulator_state(state["simulator"])
         self._begin(np.arange(self.num_envs))
         self._begun -= state["lengths"]

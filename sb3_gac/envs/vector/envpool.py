@@ -15,6 +15,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.selections import Indices, KeySelection
 from sb3_gac.envs.state import NotRestorableError
 from sb3_gac.envs.suites.extras import import_extra
@@ -154,9 +155,7 @@ def _in_order(observation: Any, order: np.ndarray) -> SimulatorObservation:
 def _threads(given: int | None, n_envs: int) -> int:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     of_torch = th.get_num_threads()
-    if given is not None and (not isinstance(given, int) or given < 1):
-        raise ValueError(f"num_threads must be a whole number above 0, got {given!r}.")
-    number = max(1, min(n_envs, cores - of_torch)) if given is None else given
+    number = max(1, min(n_envs, cores - of_torch)) if given is None else check_count("num_threads", given)
     if number + of_torch > cores > 1:
         warnings.warn(
             f"{number} threads of EnvPool and {of_torch} of torch are more than the {cores} cores. Both wait by spinning, so "

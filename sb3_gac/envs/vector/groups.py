@@ -4,11 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 from sb3_gac.envs.selections import KeySelection
 from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv
 
+_NEEDED = ("num_envs", "single_observation_space", "single_action_space", "reset", "step")
 Groups = dict[str, np.ndarray]
 
 
@@ -47,10 +49,12 @@ class GroupsVecEnv(BatchVecEnv):
         final_key: str | None = None,
         noise_std: float | Sequence[float] = 0.0,
     ):
-        if not 0 < max_action < np.inf:
+        if not isinstance(max_action, (int, float, np.integer, np.floating)) or not 0 < max_action < np.inf:
             raise ValueError(f"max_action must be a finite number above 0, got {max_action!r}.")
         self.simulator, self.final_key = simulator, final_key
-        of_one = simulator.unwrapped
+        of_one = getattr(simulator, "unwrapped", simulator)
+        if missing := [name for name in _NEEDED if not hasattr(of_one, name)]:
+            raise ValueError(f"simulator must have {', '.join(_NEEDED)}, but {of_one!r} lacks {', '.join(missing)}.")
         super().__init__(
             of_one.num_envs,
             of_one.single_observation_space,
@@ -60,7 +64,7 @@ class GroupsVecEnv(BatchVecEnv):
             noise_std=noise_std,
         )
         self.extras: Mapping[str, Any] = {}
-        self._like: Any = None
+        self._device: Any = None
         self._shown: Groups = {}
         self._has_ended = np.zeros(self.num_envs, dtype=bool)
 
@@ -92,7 +96,9 @@ class GroupsVecEnv(BatchVecEnv):
         :return: results of the step, with the last observations of episodes that have ended
         """
         before = self._shown
-        given = actions if self._like is None else self._like.new_tensor(actions)
+        given: Any = np.asarray(actions, dtype=self.action_space.dtype)
+        if self._device is not None:
+            given = th.tensor(given, device=self._device)
         groups, rewards, terminated, truncated, self.extras = self.simulator.step(given)
         self._shown = _in_arrays(groups)
         terminated, truncated = (_array(flags).astype(bool) for flags in (terminated, truncated))
@@ -105,13 +111,14 @@ class GroupsVecEnv(BatchVecEnv):
         return BatchStep(last, _array(rewards), terminated, truncated & ~terminated)
 
     def close(self) -> None:
-        """Close the simulator."""
-        self.simulator.close()
+        """Close the simulator, if it can be closed."""
+        if hasattr(self.simulator, "close"):
+            self.simulator.close()
 
     def _reset(self, **given: Any) -> Groups:
         groups, self.extras = self.simulator.reset(**given)
         first = next(iter(groups.values()))
-        self._like = first if hasattr(first, "new_tensor") else None  # actions go to the device of the observations
+        self._device = first.device if isinstance(first, th.Tensor) else None  # actions go to the device of the observations
         self._shown, self._has_ended = _in_arrays(groups), np.zeros(self.num_envs, dtype=bool)
         return self._shown
 

@@ -5,7 +5,8 @@ from typing import Any
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_gac.envs.suites import batch_factory, is_batched
+from sb3_gac.envs.arguments import check_count
+from sb3_gac.envs.suites import is_batched, make_batch
 
 
 def make_vec(env_id: str, n_envs: int = 1, seed: int | None = None, **kwargs: Any) -> VecEnv:
@@ -19,14 +20,13 @@ def make_vec(env_id: str, n_envs: int = 1, seed: int | None = None, **kwargs: An
     :param kwargs: keyword arguments of the environment, such as ``noise_std``
     :return: vectorised environments whose infos have returns and lengths of episodes
     :raises ImportError: if the simulator is not installed; the message says how to install it
-    :raises ValueError: if ``delay`` or ``drop`` is asked of a simulator that steps a batch
+    :raises ValueError: if ``n_envs`` is no positive integer, or if a simulator that steps a batch is asked for a history, a
+        delay or losses
     """
+    n_envs = check_count("n_envs", n_envs)
     if not is_batched(env_id):
         return make_vec_env(env_id, n_envs, seed=seed, env_kwargs=kwargs)
-    for name in sorted({"delay", "drop"} & set(kwargs)):
-        raise ValueError(f"{name} is for environments that are stepped one at a time, and {env_id} is one simulator of many.")
-    factory, of_task = batch_factory(env_id)
-    env: VecEnv = factory(n_envs=n_envs, **of_task | kwargs)
+    env: VecEnv = make_batch(env_id, n_envs, **kwargs)
     env.action_space.seed(seed)
     env.seed(seed)
     return env

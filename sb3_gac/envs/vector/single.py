@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_gac.envs.suites import batch_factory
+from sb3_gac.envs.suites import make_batch
 
 
 class SingleEnv(gym.Env):
@@ -94,5 +94,4 @@ def make_single(env_id: str, **kwargs: Any) -> gym.Env:
     :param kwargs: keyword arguments for the suite's vectorised environments
     :return: one environment, with its time limit
     """
-    factory, of_task = batch_factory(env_id)
-    return SingleEnv(factory(n_envs=1, **of_task | kwargs))
+    return SingleEnv(make_batch(env_id, n_envs=1, **kwargs))
