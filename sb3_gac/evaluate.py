@@ -36,7 +36,6 @@ from sb3_gac.evaluation.policies import (
     guider_of,
     learner_of,
     load_exported,
-    normalizer_of,
 )
 from sb3_gac.evaluation.results import HEADER, LEGEND, Outcome, header_of, outcome, row
 from sb3_gac.evaluation.settings import (
@@ -52,7 +51,7 @@ from sb3_gac.evaluation.settings import (
 )
 from sb3_gac.evaluation.video import check_can_film, film
 from sb3_gac.stopping import StoppedInALine
-from sb3_gac.training.environments import STATISTICS
+from sb3_gac.training.environments import STATISTICS, normalizer_of
 from sb3_gac.training.options import mapping
 from sb3_gac.training.provenance import provenance
 
@@ -144,11 +143,10 @@ def policies_of(options: argparse.Namespace, file: Path) -> tuple[str, dict[str,
             )
         return f"exported {file.suffix} file", {"learner": load_exported(file)}
     model = load_model(file, options.device)
-    normalize = normalizer_of(model, file, options.vec_normalize)
-    policies: dict[str, EvaluatedPolicy] = {"learner": learner_of(model, normalize)}
-    if options.guider:
-        policies["guider"] = guider_of(model, normalize)
-    return type(model).__name__, policies
+    makers = {"learner": learner_of, **({"guider": guider_of} if options.guider else {})}
+    entries = {key for make in makers.values() for key in make(model).entries}
+    normalize = normalizer_of(model, file, options.vec_normalize, entries)
+    return type(model).__name__, {name: make(model, normalize) for name, make in makers.items()}
 
 
 class Evaluation:
