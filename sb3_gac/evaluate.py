@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from ctypes.util import find_library
 from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import gymnasium as gym
@@ -277,8 +278,10 @@ class Evaluation:
 def _make_folder(option: str, folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):  # or else the results would be lost when they are written
+            pass
     except OSError as error:
-        raise ValueError(f"{option}: the folder {folder} can't be made: {error}") from None
+        raise ValueError(f"{option}: nothing can be written in the folder {folder}: {error}") from None
 
 
 def _cells(texts: Sequence[str]) -> str:
@@ -305,10 +308,13 @@ def _evaluate(options: argparse.Namespace, command: str) -> None:
     except (ValueError, OSError, ImportError, RuntimeError, gym.error.Error) as error:
         sys.exit(str(error))
     evaluation.run()
-    evaluation.save(command)
-    print(f"Saved in {evaluation.directory}: evaluation.md, evaluation.png, evaluation.json.")
-    if options.video is not None:
-        print(evaluation.film_worst(options.video))
+    try:
+        evaluation.save(command)
+        print(f"Saved in {evaluation.directory}: evaluation.md, evaluation.png, evaluation.json.")
+        if options.video is not None:
+            print(evaluation.film_worst(options.video))
+    except OSError as error:
+        sys.exit(f"Not all could be saved: {error}")
 
 
 @contextmanager

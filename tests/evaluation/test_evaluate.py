@@ -236,13 +236,30 @@ def test_what_is_wrong_is_said_before_anything_is_run(gac, tmp_path, monkeypatch
         (gac, "--env", "sb3_gac/HalfCheetha-v5"): "HalfCheetha",
         (gac, *NOISY[:2], "--env-kwargs", "{histroy: 2}"): "--env-kwargs: .*noisy_walk can't be made .*'histroy'",
         (gac, "--env", "sb3_gac/Hopper-v5", "--env-kwargs", "{histroy: 2}"): "--env-kwargs: .*'histroy'",
-        (gac, *NOISY, "--out", tmp_path / "other.pt"): "--out: the folder .* can't be made",
-        (gac, *NOISY, "--out", tmp_path / "other.pt" / "below"): "--out: the folder .* can't be made",
+        (gac, *NOISY, "--out", tmp_path / "other.pt"): "--out: nothing can be written in the folder",
+        (gac, *NOISY, "--out", tmp_path / "other.pt" / "below"): "--out: nothing can be written in the folder",
         (gac, *NOISY, "--vec-normalize", tmp_path / "other.pt"): "the model was trained without VecNormalize",
     }
     for arguments, message in wrong.items():
         with pytest.raises(SystemExit, match=message):
             main([*map(str, arguments)])
+
+
+def test_a_folder_that_takes_no_files_is_refused_before_anything_is_run(gac, tmp_path, monkeypatch):
+    def full(**options):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("sb3_gac.evaluate.run_episodes", None)
+    monkeypatch.setattr("sb3_gac.evaluate.TemporaryFile", full)
+    with pytest.raises(SystemExit, match=r"--out: nothing can be written in the folder .*: .*Read-only"):
+        _evaluate(gac, tmp_path, *NOISY, "--noise", "0")
+
+
+def test_what_can_not_be_saved_is_said_in_a_line_below_the_table(gac, tmp_path, capsys):
+    (tmp_path / "evaluation.json").mkdir()
+    with pytest.raises(SystemExit, match=r"Not all could be saved: .*evaluation\.json"):
+        main([str(gac), "--out", str(tmp_path), "--episodes", "1", *NOISY, "--noise", "0"])
+    assert "95% of the mean" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("content", ["", "[1]", "run: 3", "lr: 0.1", "task: {", "environment: {name: Hopper}"])
