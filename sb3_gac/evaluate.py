@@ -50,7 +50,7 @@ from sb3_gac.evaluation.settings import (
     is_real_valued,
     plan,
 )
-from sb3_gac.evaluation.video import check_can_film, film
+from sb3_gac.evaluation.video import VIDEOS, check_can_film, film
 from sb3_gac.stopping import StoppedInALine
 from sb3_gac.training.environments import STATISTICS, normalizer_of
 from sb3_gac.training.options import mapping
@@ -104,6 +104,8 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
         parser.error(f"--episodes: must be at least 1, got {options.episodes}.")
     if options.seed < 0:
         parser.error(f"--seed: must be at least 0, got {options.seed}.")
+    if options.video is not None and (options.video.suffix not in VIDEOS or options.video.is_dir()):
+        parser.error(f"--video: must be a file that ends in {' or '.join(VIDEOS)}, got {options.video}.")
     options.asked = {name: getattr(options, name) for name in DEFAULTS if getattr(options, name) is not None}
     return options
 

@@ -305,7 +305,10 @@ def test_choices_are_actions_too():
 
 @pytest.mark.parametrize(
     "options",
-    [["--episodes", "0"], ["--env-kwargs", "4"], ["--env-kwargs", "{a: ["], ["--delay", "0.5"], ["--noise"], ["--seed", "-1"]],
+    [
+        *(["--episodes", "0"], ["--env-kwargs", "4"], ["--env-kwargs", "{a: ["], ["--delay", "0.5"], ["--noise"]),
+        *(["--seed", "-1"], ["--video", "worst"], ["--video", "worst.png"]),
+    ],
 )
 def test_the_option_that_is_wrong_is_named(options, capsys):
     with pytest.raises(SystemExit):
