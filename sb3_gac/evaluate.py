@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from ctypes.util import find_library
 from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import gymnasium as gym
@@ -36,7 +37,6 @@ from sb3_gac.evaluation.policies import (
     guider_of,
     learner_of,
     load_exported,
-    normalizer_of,
 )
 from sb3_gac.evaluation.results import HEADER, LEGEND, Outcome, header_of, outcome, row
 from sb3_gac.evaluation.settings import (
@@ -50,9 +50,9 @@ from sb3_gac.evaluation.settings import (
     is_real_valued,
     plan,
 )
-from sb3_gac.evaluation.video import check_can_film, film
+from sb3_gac.evaluation.video import VIDEOS, check_can_film, film
 from sb3_gac.stopping import StoppedInALine
-from sb3_gac.training.environments import STATISTICS
+from sb3_gac.training.environments import STATISTICS, normalizer_of
 from sb3_gac.training.options import mapping
 from sb3_gac.training.provenance import provenance
 
@@ -104,6 +104,8 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
         parser.error(f"--episodes: must be at least 1, got {options.episodes}.")
     if options.seed < 0:
         parser.error(f"--seed: must be at least 0, got {options.seed}.")
+    if options.video is not None and (options.video.suffix not in VIDEOS or options.video.is_dir()):
+        parser.error(f"--video: must be a file that ends in {' or '.join(VIDEOS)}, got {options.video}.")
     options.asked = {name: getattr(options, name) for name in DEFAULTS if getattr(options, name) is not None}
     return options
 
@@ -144,11 +146,10 @@ def policies_of(options: argparse.Namespace, file: Path) -> tuple[str, dict[str,
             )
         return f"exported {file.suffix} file", {"learner": load_exported(file)}
     model = load_model(file, options.device)
-    normalize = normalizer_of(model, file, options.vec_normalize)
-    policies: dict[str, EvaluatedPolicy] = {"learner": learner_of(model, normalize)}
-    if options.guider:
-        policies["guider"] = guider_of(model, normalize)
-    return type(model).__name__, policies
+    makers = {"learner": learner_of, **({"guider": guider_of} if options.guider else {})}
+    entries = {key for make in makers.values() for key in make(model).entries}
+    normalize = normalizer_of(model, file, options.vec_normalize, entries)
+    return type(model).__name__, {name: make(model, normalize) for name, make in makers.items()}
 
 
 class Evaluation:
@@ -279,8 +280,10 @@ class Evaluation:
 def _make_folder(option: str, folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):  # or else the results would be lost when they are written
+            pass
     except OSError as error:
-        raise ValueError(f"{option}: the folder {folder} can't be made: {error}") from None
+        raise ValueError(f"{option}: nothing can be written in the folder {folder}: {error}") from None
 
 
 def _cells(texts: Sequence[str]) -> str:
@@ -307,10 +310,13 @@ def _evaluate(options: argparse.Namespace, command: str) -> None:
     except (ValueError, OSError, ImportError, RuntimeError, gym.error.Error) as error:
         sys.exit(str(error))
     evaluation.run()
-    evaluation.save(command)
-    print(f"Saved in {evaluation.directory}: evaluation.md, evaluation.png, evaluation.json.")
-    if options.video is not None:
-        print(evaluation.film_worst(options.video))
+    try:
+        evaluation.save(command)
+        print(f"Saved in {evaluation.directory}: evaluation.md, evaluation.png, evaluation.json.")
+        if options.video is not None:
+            print(evaluation.film_worst(options.video))
+    except OSError as error:
+        sys.exit(f"Not all could be saved: {error}")
 
 
 @contextmanager

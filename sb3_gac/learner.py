@@ -44,6 +44,7 @@ class OnnxPolicy:
         self._channels_first = {entry["name"] for entry in entries if entry.get("layout") == "channels first"}
         self._entries = {entry["name"]: (np.dtype(entry["dtype"]), tuple(entry["shape"])) for entry in entries}
         self._counted = {entry["name"]: (entry["smallest"], entry["largest"]) for entry in entries if "largest" in entry}
+        self._normalised = set(self.metadata["normalised"])
         self._memory: dict[str, Any] | None = self.metadata["memory"]
         self._state: np.ndarray | None = None
 
@@ -86,16 +87,21 @@ class OnnxPolicy:
             reads one entry. Images may have their channels last, as cameras give them, or first, as the policy has them
         :return: action in the environment's range; for batched observations, one for each
         :raises ValueError: if an entry is missing, not one of the policy's, of another shape or type, not finite, or, where it
-            is discrete, out of range; if the number of observations changes within an episode
+            is discrete, out of range; if the number of observations changes within an episode, or no finite action follows
         """
         inputs, n_rows = self._checked(observation)
         if n_rows is None:
             inputs = {name: value[None] for name, value in inputs.items()}
+        state = None
         if self._memory is None:
             (action,) = self._session.run(None, inputs)
         else:
             inputs[self._memory["input"]] = self._remembered(1 if n_rows is None else n_rows)
-            action, self._state = self._session.run(None, inputs)
+            action, state = self._session.run(None, inputs)
+        if not np.isfinite(action).all():
+            largest = {name: float(np.abs(value).max()) for name, value in inputs.items() if name in self._entries}
+            raise ValueError(f"The policy has no finite action for so large values: the largest of each entry are {largest}.")
+        self._state = state
         return action[0] if n_rows is None else action
 
     def _remembered(self, n_rows: int) -> np.ndarray:
@@ -130,11 +136,16 @@ class OnnxPolicy:
 
     def _checked_entry(self, name: str, value: Any) -> np.ndarray:
         dtype, shape = self._entries[name]
-        array = np.asarray(value)
+        try:
+            array = np.asarray(value)
+        except Exception as error:  # lists of different lengths, or whatever objects say that are no arrays
+            raise ValueError(f'The entry "{name}" is no array of numbers: {error}') from None
         if array.dtype != dtype:
-            if not np.can_cast(array.dtype, dtype, "same_kind"):
+            is_whole = dtype.kind in "iu" and array.dtype.kind in "iu"  # of either sign, if it holds the values
+            if not (is_whole or np.can_cast(array.dtype, dtype, "same_kind")):
                 raise ValueError(f'The entry "{name}" must be of type {dtype}, but is {array.dtype}: values would be lost.')
-            given, array = array, array.astype(dtype)
+            with np.errstate(over="ignore"):  # what becomes infinite is refused below
+                given, array = array, array.astype(dtype)
             if dtype.kind != "f" and not np.array_equal(given, array):
                 raise ValueError(f'The entry "{name}" holds values that its type {dtype} can\'t hold.')
         if name in self._channels_first:
@@ -142,8 +153,10 @@ class OnnxPolicy:
         n_leading = array.ndim - len(shape)
         if array.shape[n_leading:] != shape or n_leading not in (0, 1):
             raise ValueError(f'The entry "{name}" must have the shape {shape}, or (B, ...) of it, but has {array.shape}.')
-        if not np.isfinite(array).all():
-            raise ValueError(f'The entry "{name}" holds NaN or infinite values: no action can follow from it.')
+        if not self._is_computable(name, array):
+            raise ValueError(
+                f'The entry "{name}" holds NaN or infinite values, or values beyond float32: no action can follow from it.'
+            )
         if name in self._counted:
             smallest, largest = self._counted[name]
             if not ((array >= smallest) & (array <= largest)).all():
@@ -151,6 +164,13 @@ class OnnxPolicy:
                     f'The entry "{name}" holds values that are not from {smallest} to {largest}: {array.tolist()}.'
                 )
         return array
+
+    def _is_computable(self, name: str, array: np.ndarray) -> bool:
+        """Whether all values are finite as the policy computes with them: in float32, unless they are normalised before."""
+        if array.dtype.kind == "f" and name not in self._normalised:
+            with np.errstate(over="ignore"):
+                array = array.astype(np.float32, copy=False)
+        return bool(np.isfinite(array).all())
 
 
 def _with_channels_first(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 MODULE, SCRIPT = "sb3_gac.train", ("sb3-gac", "train")
 #: Words that start the main job in a process of Python
 _OF_PYTHON = (("-m", MODULE), ("-m", "sb3_gac", "train"))
-#: Modules of other programs, whose functions ``main`` end with :class:`StoppedInALine`
-_OTHERS = ("sb3_gac", "sb3_gac.evaluate", "sb3_gac.deploy", "sb3_gac.compare", "sb3_gac.zoo")
+#: Modules of other programs, whose functions ``main`` end with :class:`StoppedInALine`; ``envs``, which opens nothing, is
+#: ended at once at any time
+_OTHERS = ("sb3_gac", "sb3_gac.evaluate", "sb3_gac.deploy", "sb3_gac.compare", "sb3_gac.zoo", "sb3_gac.envs")
 INTERRUPTED = 128 + signal.SIGINT
 
 

@@ -179,6 +179,18 @@ def test_an_exported_policy_has_the_statistics_of_vec_normalize(is_beside, tmp_p
     np.testing.assert_allclose(policy.act({"partial": raw}, np.ones(1, bool)), expected, atol=1e-4)
 
 
+def test_no_statistics_are_asked_for_of_what_an_exported_policy_does_not_read(tmp_path, capsys):
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    from tests.helpers import TwoViewBandit
+
+    env = VecNormalize(DummyVecEnv([TwoViewBandit]), norm_obs_keys=["privileged"])
+    model = GAC("MultiInputPolicy", env, buffer_size=100, policy_kwargs={"net_arch": [4]}, device="cpu").learn(5)
+    model.save(tmp_path / "model")
+    main(["export", str(tmp_path), str(tmp_path / "x.pt")])
+    assert "which reads partial; its actions were compared" in capsys.readouterr().out
+
+
 def test_all_entries_that_a_policy_reads_are_normalised_in_its_file(tmp_path):
     import numpy as np
     from gymnasium import spaces

@@ -123,6 +123,8 @@ def test_a_noise_is_the_nearest_entry_within_rounding():
         for noise in (0.1 + 0.2, np.float32(0.3).item(), 0.3 - 1e-12):
             assert noise != 0.3
             assert preset("paper", task="Ant", noise=noise)["target_kl"] == 0.001
+        for noise in (np.float32(0.3), np.array(0.3)[()]):
+            assert preset("paper", task="Ant", noise=noise)["target_kl"] == 0.001
         assert preset("paper", task="Ant", noise=1e-12)["target_kl"] == 0.01
         for name in ("small", "paper"):
             for task in PRESETS[name].tasks:
@@ -173,9 +175,9 @@ def test_what_is_no_number_is_that_of_the_nearer_noise(tmp_path, monkeypatch):
     assert [arguments["policy_kwargs"] for arguments in found] == [{}, {"n_critics": 3}]
 
 
-@pytest.mark.parametrize("noise", [-0.1, float("nan"), None, "0.1"])
+@pytest.mark.parametrize("noise", [-0.1, float("nan"), float("inf"), None, "0.1", True])
 def test_a_noise_that_is_none_is_refused(noise):
-    with pytest.raises(ValueError, match="noise must be a number of at least 0, got"):
+    with pytest.raises(ValueError, match="noise must be a finite number of at least 0, got"):
         preset("small", task="Ant", noise=noise)
 
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_gac import GAC, GuiderLearnerEvalCallback
 from sb3_gac.train import main, parse_arguments
 from sb3_gac.training import evaluation, job
-from sb3_gac.training.evaluation import PartialOnly
+from sb3_gac.training.evaluation import DeployedView
 from sb3_gac.training.job import Job, finish, prepare
 from sb3_gac.training.options import algorithm_arguments
 
@@ -62,15 +62,36 @@ def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_pat
     assert action.shape == (1,)
 
 
-def test_the_learner_is_evaluated_on_partial_alone():
+@pytest.mark.parametrize("entries", [["partial"], ["partial", "gear"]])
+def test_the_learner_is_evaluated_on_what_it_reads_alone(entries):
     seen = []
 
     class Model:
+        policy = SimpleNamespace(role_keys={"learner": entries}, roles=SimpleNamespace(deployed="learner"))
+
         def predict(self, observation, *args, **kwargs):
             seen.append(observation)
 
-    PartialOnly(Model()).predict({"partial": 1, "privileged": 2}, deterministic=True)
-    assert seen == [{"partial": 1}]
+    DeployedView(Model()).predict({"partial": 1, "gear": 2, "privileged": 3}, deterministic=True)
+    assert seen == [{"partial": 1, "gear": 2} if "gear" in entries else {"partial": 1}]
+
+
+def test_a_learner_may_read_more_than_partial(tmp_path, capsys):
+    options = ["--env", "tests.training.test_options:make_geared", "--steps", "40", "--episodes", "1", "--runs", str(tmp_path)]
+    main([*options, "--overrides", "{learning_starts: 20, role_keys: {learner: [partial, gear]}}"])
+    (directory,) = tmp_path.iterdir()
+    assert np.isfinite(json.loads((directory / "results.json").read_text())["learner"])
+    output = capsys.readouterr().out
+    assert "Learner, seeing `partial` and `gear` alone: return" in output
+    use = "model.predict({\"partial\": observation['partial'], \"gear\": observation['gear']}, deterministic=True)"
+    assert use in output
+
+
+def test_a_log_that_nothing_can_write_is_refused_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr("stable_baselines3.common.utils.SummaryWriter", None)
+    with pytest.raises(SystemExit, match=r"error: --tensorboard: TensorBoard is not installed: pip install tensorboard"):
+        main([*QUICK, "--tensorboard", "--runs", str(tmp_path)])
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("arguments", [["--task", "Cheetah"], ["--privileged", "all"], ["--preset", "large"]])
@@ -189,7 +210,7 @@ def test_a_preset_that_normalises_observations_leaves_their_statistics(tmp_path,
     model = GAC.load(directory / "model")
     assert model.trained_normalised
     results = json.loads((directory / "results.json").read_text())
-    assert results["learner"] == pytest.approx(job.evaluate(PartialOnly(model), statistics, 2)[0], rel=1e-3)
+    assert results["learner"] == pytest.approx(job.evaluate(DeployedView(model), statistics, 2)[0], rel=1e-3)
 
 
 @pytest.mark.usefixtures("_quick")
@@ -356,9 +377,10 @@ def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_pat
 
     def evaluated(policy, env, n_eval_episodes):
         asked.append((type(policy).__name__, n_eval_episodes, env.seeds.pop()))
-        return {"PartialOnly": (1.0, 2.0), "UniformActions": (3.0, 4.0)}[asked[-1][0]]
+        return {"DeployedView": (1.0, 2.0), "UniformActions": (3.0, 4.0)}[asked[-1][0]]
 
-    model = SimpleNamespace(save=Path.touch, num_timesteps=7, compiles=True, learning_starts=5)
+    policy = SimpleNamespace(role_keys={"learner": ["partial", "gear"]}, roles=SimpleNamespace(deployed="learner"))
+    model = SimpleNamespace(save=Path.touch, num_timesteps=7, compiles=True, learning_starts=5, policy=policy)
     space = SimpleNamespace(seed=lambda seed: None)
     seeds, drawn = [], []
     env = SimpleNamespace(seeds=seeds, seed=seeds.append, action_space=space, num_envs=1)
@@ -366,8 +388,8 @@ def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_pat
     monkeypatch.setattr(job, "draw_learning_curve", lambda *args: drawn.extend(args))
     (tmp_path / "checkpoints").mkdir()
     finish(Job(parse_arguments(["--episodes", "3"]), tmp_path, model, env), [], 1.5)
-    assert asked == [("PartialOnly", 3, 10_000), ("UniformActions", 3, 10_000)]
-    assert drawn[-2:] == [3.0, 5], "what is marked: the return of random actions, and the warm-up"
+    assert asked == [("DeployedView", 3, 10_000), ("UniformActions", 3, 10_000)]
+    assert drawn[-3:] == [3.0, 5, "partial and gear"], "the return of random actions, the warm-up, and what the learner reads"
     results = json.loads((tmp_path / "results.json").read_text())
     assert [results.pop(name) for name in ("learner", "learner_std", "random", "random_std")] == [1.0, 2.0, 3.0, 4.0]
     assert results == {"steps": 7, "minutes": 1.5, "compiled": True, "history": []}

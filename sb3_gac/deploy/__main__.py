@@ -13,10 +13,9 @@ from pathlib import Path
 
 from sb3_gac.base.loading import load_model, model_file
 from sb3_gac.deploy.export import WRITERS, export_learner
-from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import ExportError
 from sb3_gac.stopping import StoppedInALine
-from sb3_gac.training.environments import STATISTICS, read_statistics, statistics_of
+from sb3_gac.training.environments import STATISTICS, normalizer_of
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -55,9 +54,7 @@ def _export(options: argparse.Namespace, units: dict[str, str]) -> str:
     file = model_file(options.model)
     model = load_model(file, device="cpu")
     reads = model.policy.role_keys[model.policy.roles.deployed]
-    statistics, normalizer = statistics_of(model, file, options.vec_normalize), None
-    if statistics is not None:
-        normalizer = DeploymentNormalizer.from_vec_normalize(read_statistics(statistics, model), reads)
+    normalizer = normalizer_of(model, file, options.vec_normalize, reads)
     path = export_learner(model, options.out, normalizer, units)
     policy = f"the deployed policy of {type(model).__name__}, which reads {' and '.join(reads)}"
     return f"Wrote {path}: {policy}; its actions were compared."

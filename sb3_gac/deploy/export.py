@@ -19,7 +19,7 @@ from torch import nn
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.checks.entries import computable
 from sb3_gac.checks.scale import entries_normalised_in_training
-from sb3_gac.checks.values import check_positive, index_bounds
+from sb3_gac.checks.values import check_integer, index_bounds
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import check_agreement, draw_observations
 from sb3_gac.envs.suites.extras import missing_extra
@@ -127,8 +127,8 @@ def export_learner(
     :param verify_on: number of observations on which the file's actions are compared with those of ``predict``, by
         :func:`sb3_gac.deploy.verification.check_agreement`
     :return: path of the file
-    :raises ValueError: if the suffix is another, ``verify_on`` is not above 0, a unit is for an entry that the policy does not
-        read, the model learned under a ``VecNormalize`` that it does not have any more, or a wrapper outside of
+    :raises ValueError: if the suffix is another, ``verify_on`` is no integer above 0, a unit is for an entry that the policy
+        does not read, the model learned under a ``VecNormalize`` that it does not have any more, or a wrapper outside of
         ``VecNormalize`` changes the observations
     :raises ImportError: if an ONNX file is wanted, and onnx or onnxruntime is not installed
     :raises ExportError: if the file's actions are not those of ``predict``; no file is then written
@@ -136,7 +136,7 @@ def export_learner(
     path = Path(path)
     if path.suffix not in WRITERS:
         raise ValueError(f'path must end in ".onnx" or, for TorchScript, ".pt", got {str(path)!r}.')
-    check_positive("verify_on", verify_on)
+    check_integer("verify_on", verify_on, 1)
     normalizer = _normalizer_of(model) if normalizer is None else normalizer
     module = DeployedModule(deepcopy(model.policy.deployed), normalizer).cpu().eval().requires_grad_(False)
     metadata = json.dumps(describe(module, type(model).__name__, units or {}), allow_nan=False)

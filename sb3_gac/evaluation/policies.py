@@ -11,7 +11,6 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
-from sb3_gac.training.environments import read_statistics, statistics_of
 
 Observations = Mapping[str, np.ndarray]
 Shapes = dict[str, tuple[int, ...]]
@@ -129,12 +128,20 @@ class TorchScriptRunner:
         :param observation: entry -> its values in a single observation
         :return: action for the observation, in the environment's range
         """
-        entries = [np.asarray(observation[entry["name"]], entry["dtype"])[None] for entry in self._metadata["entries"]]
-        result = self._module(*map(th.as_tensor, entries), *self._state)
+        entries = [
+            _in_layout(np.asarray(observation[entry["name"]], entry["dtype"]), entry) for entry in self._metadata["entries"]
+        ]
+        result = self._module(*(th.as_tensor(entry[None]) for entry in entries), *self._state)
         if self._state:
             result, self._state[0] = result
         action: np.ndarray = result.numpy()[0]
         return action
+
+
+def _in_layout(value: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
+    """One value of an exported policy's entry; of an image, the channels as the file has them."""
+    has_channels_last = entry.get("layout") == "channels first" and value.shape != tuple(entry["shape"])
+    return np.moveaxis(value, -1, 0) if has_channels_last else value
 
 
 def load_exported(path: Path) -> ExportedPolicy:
@@ -193,22 +200,3 @@ def _shapes(model: AsymmetricAlgorithm, roles: Sequence[str]) -> Shapes:
     keys = dict.fromkeys(key for role in roles for key in model.policy.role_keys[role])
     assert isinstance(model.observation_space, spaces.Dict)
     return {key: tuple(model.observation_space[key].shape or ()) for key in keys}
-
-
-def normalizer_of(model: AsymmetricAlgorithm, file: Path, given: Path | None) -> Callable[[Any], Any] | None:
-    """
-    Find the normalisation that a model's observations need.
-
-    :param model: trained model, which knows whether it learned from normalised observations
-    :param file: file of the model
-    :param given: file that ``VecNormalize.save`` wrote, ``None`` for that beside the model
-    :return: function that normalises a batch of observations as ``VecNormalize`` did in training, ``None`` if the model was
-        trained without
-    :raises ValueError: if a file is given for a model trained without ``VecNormalize``, or no file for one trained with it
-    :raises FileNotFoundError: if there is no such file
-    """
-    statistics = statistics_of(model, file, given)
-    if statistics is None:
-        return None
-    normalize: Callable[[Any], Any] = read_statistics(statistics, model).normalize_obs
-    return normalize

@@ -19,6 +19,7 @@ from sb3_gac.evaluation.policies import EvaluatedPolicy
 EXTRA, PROGRAM = "video", "sb3-gac evaluate --video"
 STRIP, MARGIN, WINDOW = 140, 12, 100  # pixels, pixels, steps
 MEASURED, GOT, PAPER, INK = (120, 120, 120), (230, 100, 0), (255, 255, 255), (30, 30, 30)
+VIDEOS = (".mp4", ".mkv", ".mov", ".avi")  # endings by which the writer knows what to write
 Series = list[np.ndarray]
 
 

@@ -4,6 +4,7 @@ import inspect
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 _ROUNDING = {"rel_tol": 1e-6, "abs_tol": 1e-9}  # rounding of float32, and of sums such as 0.1 + 0.2
@@ -23,10 +24,11 @@ def at_noise(
     :param noise: standard deviation of the sensor noise
     :param below: layers of arguments that hold where ``by_noise`` has none
     :return: layers of arguments on top of ``below``; none if the noise is below all levels
-    :raises ValueError: if the noise is negative or no number
+    :raises ValueError: if the noise is negative, infinite or no number
     """
-    if not (_is_number(noise) and noise >= 0):
-        raise ValueError(f"noise must be a number of at least 0, got {noise!r}.")
+    if not (_is_number(noise) and 0 <= noise < math.inf):
+        raise ValueError(f"noise must be a finite number of at least 0, got {noise!r}.")
+    noise = float(noise)
     for level, layers in by_noise.items():
         if math.isclose(noise, level, **_ROUNDING):
             return list(layers)
@@ -57,7 +59,7 @@ def _between(low: Any, high: Any, share: float) -> Any:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, Real) and not isinstance(value, bool)  # numpy's numbers are Real as well
 
 
 def defaults_of(algorithm: type) -> dict[str, Any]:

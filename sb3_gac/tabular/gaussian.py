@@ -72,9 +72,16 @@ def coefficient_for(
 
     if not 0 < target_kl < kl_at(best):
         raise ValueError(f"target_kl must be above 0 and below {kl_at(best):g}, the KL of the best action, got {target_kl!r}.")
-    low, high = np.log(1e-12), np.log(1e12)
+
+    def is_too_far(log_alpha: float) -> bool:
+        return kl_at(guider_optimum(float(np.exp(log_alpha)), learner_mean, std, curvature, best)) > target_kl
+
+    low, high = -28.0, 28.0
+    while high < 700 and is_too_far(high):  # up to the largest alpha that a float holds
+        high += 28
+    while low > -700 and not is_too_far(low):
+        low -= 28
     for _ in range(200):
         middle = (low + high) / 2
-        too_far = kl_at(guider_optimum(float(np.exp(middle)), learner_mean, std, curvature, best)) > target_kl
-        low, high = (middle, high) if too_far else (low, middle)
+        low, high = (middle, high) if is_too_far(middle) else (low, middle)
     return float(np.exp(high))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_gac.tabular.improvement import improved_guider, improved_learner, learner_by_own_critic
-from sb3_gac.tabular.pomdp import TabularPOMDP, action_values, visits
+from sb3_gac.tabular.pomdp import TabularPOMDP, action_values, check_above_zero, visits
 from sb3_gac.tabular.values import guided_values
 
 DISTILLATION, OWN_CRITIC = "distillation", "own critic"
@@ -54,13 +54,16 @@ def guided_policy_iteration(
     :param weights: weights of states in the learner's step, shape (S,); ``None`` for the new guider's discounted visits, with
         which eq. 4 can't fall
     :return: iterator over the first policies and those after each iteration
-    :raises ValueError: if ``alpha`` is not above 0, or ``step`` is unknown
+    :raises ValueError: if ``alpha`` is not above 0, ``step`` is unknown, or ``learner`` or ``weights`` are impossible
     """
-    if not alpha > 0:
-        raise ValueError(f"alpha must be above 0, got {alpha!r}.")
+    check_above_zero("alpha", alpha)
     if step not in (DISTILLATION, OWN_CRITIC):
         raise ValueError(f"step must be {DISTILLATION!r} or {OWN_CRITIC!r}, got {step!r}.")
-    return _iterate(pomdp, alpha, uniform_learner(pomdp) if learner is None else learner, step, weights)
+    learner = uniform_learner(pomdp) if learner is None else np.asarray(learner)
+    pomdp.by_state(learner)  # raises here, not at the first step
+    if weights is not None:
+        pomdp.shares(weights)
+    return _iterate(pomdp, alpha, learner, step, weights)
 
 
 def _iterate(

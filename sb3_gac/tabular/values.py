@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_gac.tabular.pomdp import TabularPOMDP, state_values
+from sb3_gac.tabular.pomdp import TabularPOMDP, check_policy, expected, state_values
 
 
 def divergence(guider: np.ndarray, learner: np.ndarray) -> np.ndarray:
@@ -14,8 +14,7 @@ def divergence(guider: np.ndarray, learner: np.ndarray) -> np.ndarray:
     :return: KL(guider || learner) in nats, shape (S,); infinite where the guider takes an action that the learner never takes
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        terms = np.where(guider > 0, guider * (np.log(guider) - np.log(learner)), 0.0)
-    return terms.sum(axis=1)
+        return expected(guider, np.log(guider) - np.log(learner))
 
 
 def guided_backup(
@@ -31,8 +30,8 @@ def guided_backup(
     :param values: Q of states and actions, shape (S, A)
     :return: next Q of states and actions, shape (S, A)
     """
-    after = (guider * values).sum(axis=1) - alpha * divergence(guider, pomdp.by_state(learner))
-    return pomdp.rewards + pomdp.gamma * pomdp.transitions @ after
+    cost = _cost(pomdp, alpha, guider, learner)
+    return pomdp.rewards + pomdp.discounted_next(expected(guider, values) - cost)
 
 
 def guided_values(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner: np.ndarray) -> np.ndarray:
@@ -45,7 +44,7 @@ def guided_values(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner
     :param learner: the learner's probabilities of actions by observation, shape (O, A)
     :return: guided Q of states and actions, shape (S, A)
     """
-    return pomdp.rewards + pomdp.gamma * pomdp.transitions @ _guided_state_values(pomdp, alpha, guider, learner)
+    return pomdp.rewards + pomdp.discounted_next(_guided_state_values(pomdp, alpha, guider, learner))
 
 
 def guided_objective(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner: np.ndarray) -> float:
@@ -58,7 +57,7 @@ def guided_objective(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, lear
     :param learner: the learner's probabilities of actions by observation, shape (O, A)
     :return: expected value from the start distribution
     """
-    return float(pomdp.start @ _guided_state_values(pomdp, alpha, guider, learner))
+    return float(expected(pomdp.start, _guided_state_values(pomdp, alpha, guider, learner)))
 
 
 def augmented_rewards(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner: np.ndarray) -> np.ndarray:
@@ -75,9 +74,15 @@ def augmented_rewards(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, lea
     :param learner: the learner's probabilities of actions by observation, shape (O, A)
     :return: corrected rewards r - alpha gamma E[KL in the next state], shape (S, A)
     """
-    return pomdp.rewards - alpha * pomdp.gamma * pomdp.transitions @ divergence(guider, pomdp.by_state(learner))
+    return pomdp.rewards - pomdp.discounted_next(_cost(pomdp, alpha, guider, learner))
 
 
 def _guided_state_values(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner: np.ndarray) -> np.ndarray:
-    own = (guider * pomdp.rewards).sum(axis=1) - alpha * divergence(guider, pomdp.by_state(learner))
-    return state_values(pomdp, guider, own)
+    cost = _cost(pomdp, alpha, guider, learner)
+    return state_values(pomdp, guider, (guider * pomdp.rewards).sum(axis=1) - cost)
+
+
+def _cost(pomdp: TabularPOMDP, alpha: float, guider: np.ndarray, learner: np.ndarray) -> np.ndarray:
+    """alpha times the KL from guider to learner in each state, shape (S,); with alpha = 0 an infinite KL costs nothing."""
+    kl = divergence(check_policy("guider", guider, pomdp.rewards.shape), pomdp.by_state(learner))
+    return alpha * kl if alpha else np.zeros_like(kl)

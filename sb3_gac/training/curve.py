@@ -6,9 +6,16 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
+from sb3_gac.envs.spaces import PARTIAL
+
 
 def draw_learning_curve(
-    history: Sequence[Mapping[str, float]], title: str, path: Path, random: float | None = None, warm_up: float = 0
+    history: Sequence[Mapping[str, float]],
+    title: str,
+    path: Path,
+    random: float | None = None,
+    warm_up: float = 0,
+    seen: str = PARTIAL,
 ) -> None:
     """
     Draw the policies' returns over environment steps and, where the evaluations have it, the KL with its target.
@@ -19,6 +26,7 @@ def draw_learning_curve(
     :param path: path of the picture
     :param random: mean return of random actions, drawn as a line; ``None`` for no line
     :param warm_up: number of environment steps with random actions at the start, drawn as a shaded area
+    :param seen: entries that the learner reads, in words
     """
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
@@ -27,7 +35,7 @@ def draw_learning_curve(
     figure, axes = plt.subplots(1, 1 + with_kl, figsize=(5 + 5 * with_kl, 4), layout="constrained", squeeze=False)
     steps = [row["timesteps"] for row in history]
     returns = axes[0, 0]
-    returns.plot(steps, [row["learner"] for row in history], label="learner (partial alone)", marker="o")
+    returns.plot(steps, [row["learner"] for row in history], label=f"learner ({seen} alone)", marker="o")
     if any("guider" in row for row in history):
         returns.plot(steps, [row.get("guider", np.nan) for row in history], label="guider (privileged)", linestyle="--")
     if random is not None:

@@ -4,7 +4,7 @@ import json
 import os
 import time
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from inspect import isclass, isroutine
 from pathlib import Path
 from typing import Any
@@ -161,17 +161,19 @@ def how_to_go_on(directory: Path, steps: int) -> str:
     return f"Stopped; {done} are saved. To go on: {command('--resume', str(directory))}"
 
 
-def summary(directory: Path, options: Namespace) -> str:
+def summary(directory: Path, options: Namespace, entries: Sequence[str] = (PARTIAL,)) -> str:
     """
     The message at the end of a run.
 
     :param directory: directory of the finished run
     :param options: options of the run, see :func:`resolve`
+    :param entries: entries that the learner reads
     :return: text with the results, and how to use the learner
     """
     results = json.loads((directory / RESULTS).read_text())
     name = algorithm_class(options.algorithm).__name__
     learner, random = (f"{shown(results[key])} +- {shown(results[f'{key}_std'])}" for key in ("learner", "random"))
+    observation = ", ".join(f'"{key}": {"observation" if len(entries) == 1 else f"observation[{key!r}]"}' for key in entries)
     statistics = directory / STATISTICS
     normalised = (
         f"""
@@ -181,11 +183,11 @@ The observation is to be normalised by {statistics}, as in training; a file of `
     )
     return f"""
 Trained {name} on {in_words(options)} for {results["steps"]:,} steps in {results["minutes"]:.1f} minutes.
-Learner, seeing `{PARTIAL}` alone: return {learner} over {options.episodes} episodes.
+Learner, seeing {" and ".join(f"`{key}`" for key in entries)} alone: return {learner} over {options.episodes} episodes.
 Random actions, same seeds: {random}.
 Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:
     from sb3_gac import {name}; model = {name}.load("{directory / MODEL}")
-    action, _ = model.predict({{"{PARTIAL}": observation}}, deterministic=True){normalised}"""
+    action, _ = model.predict({{{observation}}}, deterministic=True){normalised}"""
 
 
 def in_words(options: Namespace) -> str:

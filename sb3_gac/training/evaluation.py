@@ -1,29 +1,37 @@
 """Evaluation of a finished run: the learner as it is deployed, beside random actions."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_gac.envs import PARTIAL
-
 EVAL_SEED = 10_000
 
 
-class PartialOnly:
+def entries_read_by(model: Any) -> Sequence[str]:
     """
-    A policy that gives a model the partial entry alone, as on the robot.
+    :param model: model of one of this package's algorithms
+    :return: entries that its deployed policy reads
+    """
+    entries: Sequence[str] = model.policy.role_keys[model.policy.roles.deployed]
+    return entries
 
-    :param model: model with a method ``predict``
+
+class DeployedView:
+    """
+    A policy that gives a model the entries of its deployed policy alone, as on the robot.
+
+    :param model: model of one of this package's algorithms
     """
 
     def __init__(self, model: Any):
-        self._model = model
+        self._model, self._entries = model, entries_read_by(model)
 
     def predict(self, observation: dict[str, np.ndarray], *args: Any, **kwargs: Any) -> Any:
-        """The model's actions on the partial entry, with the arguments and result of the model's ``predict``."""
-        return self._model.predict({PARTIAL: observation[PARTIAL]}, *args, **kwargs)
+        """The model's actions on these entries, with the arguments and result of the model's ``predict``."""
+        return self._model.predict({key: observation[key] for key in self._entries}, *args, **kwargs)
 
 
 class UniformActions:

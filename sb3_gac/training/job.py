@@ -1,4 +1,4 @@
-"""The main job: train a model, evaluate the learner on its partial observation alone, and save the results."""
+"""The main job: train a model, evaluate the learner on what it reads alone, and save the results."""
 
 import json
 import shutil
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gymnasium.error import Error as GymnasiumError
+from stable_baselines3.common import utils
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
@@ -33,7 +34,7 @@ from sb3_gac.training.directory import (
     write_configuration,
 )
 from sb3_gac.training.environments import STATISTICS, find_modules_here, make_envs, normalized
-from sb3_gac.training.evaluation import EVAL_SEED, PartialOnly, UniformActions, evaluate
+from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, UniformActions, entries_read_by, evaluate
 from sb3_gac.training.options import EPISODES_ON_THE_WAY, algorithm_arguments
 from sb3_gac.training.progress import Progress
 
@@ -66,6 +67,7 @@ def prepare(options: Namespace) -> Job:
     :return: run that is ready to train
     :raises ValueError: if the environment or an argument is wrong, or another process makes the run; then nothing was written
     """
+    _check_log(options)
     set_random_seed(options.seed)
     env, eval_env = open_environments(options)
     with ExitStack() as held:
@@ -77,6 +79,11 @@ def prepare(options: Namespace) -> Job:
         print(f"{begins} {options.steps:,} steps: {name} on {in_words(options)}. Ctrl-C stops, and says how to go on.")
         print(f"All of it is in {directory}", flush=True)
         return Job(options, directory, model, eval_env, held.pop_all())
+
+
+def _check_log(options: Namespace) -> None:
+    if options.tensorboard and getattr(utils, "SummaryWriter", None) is None:  # SB3 says so only when training starts
+        raise ValueError("--tensorboard: TensorBoard is not installed: pip install tensorboard.")
 
 
 def _begun(options: Namespace, env: VecEnv, held: ExitStack) -> tuple[Path, Any, bool]:
@@ -199,10 +206,11 @@ def finish(job: Job, history: list[dict[str, float]], minutes: float) -> None:
         of_training.save(str(directory / STATISTICS))
         sync_envs_normalization(of_training, eval_env)
     _save(model, directory / f"{MODEL}.zip")
-    learner, learner_std = evaluate(PartialOnly(model), eval_env, options.episodes)
+    learner, learner_std = evaluate(DeployedView(model), eval_env, options.episodes)
     random, random_std = evaluate(UniformActions(eval_env), eval_env, options.episodes)
     warm_up = getattr(model, "learning_starts", 0)
-    draw_learning_curve(history, _title(options, model), directory / "learning_curve.png", random, warm_up)
+    title, seen = _title(options, model), " and ".join(entries_read_by(model))
+    draw_learning_curve(history, title, directory / "learning_curve.png", random, warm_up, seen)
     results = {
         "learner": learner,
         "learner_std": learner_std,

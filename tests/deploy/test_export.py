@@ -297,6 +297,10 @@ def test_one_module_is_all_that_the_robot_needs(tmp_path):
         (np.zeros((1, 1, 2)), r'"partial" must have the shape \(2,\)'),
         (np.array([0.0, np.nan]), '"partial" holds NaN'),
         (np.array(["a", "b"]), '"partial" must be of type float32, but is <U1'),
+        (np.array([0.0, -1e300]), '"partial" holds NaN or infinite values, or values beyond float32'),
+        (np.array([0.0, np.inf]), '"partial" holds NaN'),
+        ([[0.0], [0.0, 1.0]], '"partial" is no array of numbers'),
+        ((np.zeros(2), {}), '"partial" is no array of numbers'),
     ],
 )
 def test_bad_observations(observation, message, tmp_path):
@@ -343,9 +347,40 @@ def test_entries_of_any_kind(space, tmp_path):
     np.testing.assert_allclose(learner.act(drawn), model.predict({"partial": drawn}, deterministic=True)[0], atol=1e-5)
 
 
+def test_no_action_that_is_not_finite_reaches_the_robot(tmp_path):
+    """Numbers that float32 holds may still overflow in the network."""
+    model = small_model(TwoViewBandit())
+    with th.no_grad():
+        model.policy.deployed.latent_net[0].weight.fill_(-1.5)  # SiLU of -inf is NaN
+    learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx"))
+    with pytest.raises(ValueError, match=r"no finite action for so large values: the largest of each entry are .*3\.\d*e\+38"):
+        learner.act(np.array([3e38, 3e38], np.float32))
+    assert learner.act(np.array([3e30, 3e30], np.float32)).shape == (1,)
+
+
+def test_numbers_of_any_size_and_integers_of_either_sign_are_taken_where_they_fit(tmp_path):
+    entries = spaces.Dict(
+        partial=spaces.Box(0, 255, (2,), np.uint8), far=spaces.Box(-1, 1, (2,), np.float64), privileged=VECTOR
+    )
+    env = VecNormalize(DummyVecEnv([lambda: Sampled(entries)]), norm_obs_keys=["far"])
+    reads = {"learner": ["partial", "far"]}
+    for envs, takes_far_values in ((env, True), (Sampled(entries), False)):
+        model = small_model(envs, role_keys=reads)
+        learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx", verify_on=4))
+        good = {"partial": np.array([3, 250], np.uint8), "far": np.array([0.5, -0.5])}
+        expected = learner.act(good)
+        np.testing.assert_array_equal(learner.act(good | {"partial": [3, 250]}), expected)
+        for values in ([-1, 3], [3, 256]):
+            with pytest.raises(ValueError, match='"partial" holds values that its type uint8 can'):
+                learner.act(good | {"partial": values})
+        with nullcontext() if takes_far_values else pytest.raises(ValueError, match=r'"far" holds NaN .* beyond float32'):
+            assert np.isfinite(learner.act(good | {"far": np.array([1e300, 0.0])})).all(), "normalised, it is clipped"
+
+
 def test_bad_files(tmp_path):
-    with pytest.raises(ValueError, match="verify_on must be a number > 0, got 0"):
-        export_learner(small_model(TwoViewBandit()), tmp_path / "learner.onnx", verify_on=0)
+    for number in (0, 2.5):
+        with pytest.raises(ValueError, match=f"verify_on must be an integer >= 1, got {number}"):
+            export_learner(small_model(TwoViewBandit()), tmp_path / "learner.onnx", verify_on=number)
     with pytest.raises(ValueError, match=r"units names \['torque'\], but the policy reads \['partial'\] and gives 'action'"):
         export_learner(small_model(TwoViewBandit()), tmp_path / "learner.onnx", units={"torque": "N m"})
     with pytest.raises(ValueError, match=r'must end in ".onnx"'):

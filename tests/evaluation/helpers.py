@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import FilterObservation
 
 from sb3_gac.envs import History, SensorNoise
 from sb3_gac.evaluation.policies import EvaluatedPolicy
@@ -57,6 +58,11 @@ def noisy_walk(noise_std=0.2, history=1, **kwargs):
 def blind_walk():
     """That nobody can draw."""
     return Walk()
+
+
+def walk_without_privileged():
+    """As on the robot."""
+    return FilterObservation(Walk(), ["partial"])
 
 
 class Remembering(EvaluatedPolicy):

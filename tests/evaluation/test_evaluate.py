@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, export_learner
@@ -18,11 +19,11 @@ from sb3_gac.base.loading import load_model
 from sb3_gac.evaluate import main, parse_arguments
 from sb3_gac.evaluation.episodes import Episode, run_episodes
 from sb3_gac.evaluation.figure import draw
-from sb3_gac.evaluation.policies import guider_of, learner_of
+from sb3_gac.evaluation.policies import guider_of, learner_of, load_exported
 from sb3_gac.evaluation.results import HEADER, outcome, row
 from sb3_gac.evaluation.settings import UNDISTURBED, Environment, Setting
 from tests.evaluation.helpers import ENV, Walk, noisy_walk
-from tests.helpers import small_model
+from tests.helpers import Sampled, small_model
 from tests.registry import make
 
 SMALL = {"buffer_size": 100, "policy_kwargs": {"net_arch": [8]}, "device": "cpu", "seed": 0}
@@ -150,15 +151,19 @@ def test_the_statistics_of_vec_normalize_count(tmp_path):
     (tmp_path / "other.pkl").write_bytes(pickle.dumps({"mean": 0}))
     foreign = VecNormalize(DummyVecEnv([lambda: noisy_walk(history=2)]))
     foreign.save(str(tmp_path / "foreign.pkl"))
+    VecNormalize(DummyVecEnv([Walk]), norm_obs=False).save(str(tmp_path / "rewards.pkl"))
+    VecNormalize(DummyVecEnv([Walk]), norm_obs_keys=["privileged"]).save(str(tmp_path / "privileged.pkl"))
     for name, message in {
         "none": "there is no file",
         ".": "there is no file",
         "garbage.pkl": "is no file that VecNormalize.save wrote",
         "other.pkl": "holds dict, not what VecNormalize.save writes",
+        "rewards.pkl": r"rewards\.pkl has no statistics of \['partial', 'privileged'\], which were normalised in training",
+        "privileged.pkl": r"privileged\.pkl has no statistics of \['partial'\], which were",
         "foreign.pkl": r"is of another environment: its \"partial\" has the shape \(5,\), and the model's \(2,\)",
     }.items():
         with pytest.raises(SystemExit, match=message):
-            _evaluate(tmp_path / "normalised.zip", tmp_path, *options, "--vec-normalize", str(tmp_path / name))
+            _evaluate(tmp_path / "normalised.zip", tmp_path, *options, "--guider", "--vec-normalize", str(tmp_path / name))
     statistics = str(tmp_path / "statistics.pkl")
     found = _evaluate(tmp_path / "normalised", tmp_path, *options, "--vec-normalize", statistics, "--guider")
     (tmp_path / "statistics.pkl").rename(tmp_path / "vecnormalize.pkl")
@@ -173,6 +178,42 @@ def test_the_statistics_of_vec_normalize_count(tmp_path):
             observation, reward, terminated, truncated, _ = inner.step(action)
             total, is_over = total + reward, terminated or truncated
         assert result["returns"][0] == pytest.approx(total, rel=1e-4)
+
+
+def test_statistics_are_needed_of_what_a_policy_reads_alone(tmp_path):
+    """Neither those of an entry that it does not read, nor that entry in the environment of the evaluation."""
+    env = VecNormalize(DummyVecEnv([Walk]), norm_obs_keys=["privileged"])
+    GAC("MultiInputPolicy", env, **SMALL).learn(20).save(tmp_path / "model")
+    options = ("--env", ENV, "--noise", "0")
+    without = _evaluate(tmp_path / "model.zip", tmp_path, *options)
+    with pytest.raises(SystemExit, match="pass --vec-normalize"):
+        _evaluate(tmp_path / "model.zip", tmp_path, *options, "--guider")
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    assert _evaluate(tmp_path / "model.zip", tmp_path, *options)["results"] == without["results"]
+    both = _evaluate(tmp_path / "model.zip", tmp_path, *options, "--guider")
+    assert [result["policy"] for result in both["results"]] == ["learner", "guider"]
+    whole = VecNormalize(DummyVecEnv([Walk]))
+    GAC("MultiInputPolicy", whole, **SMALL).learn(20).save(tmp_path / "whole")
+    whole.save(str(tmp_path / "vecnormalize.pkl"))
+    on_the_robot = ("--env", "tests.evaluation.helpers:walk_without_privileged", "--noise", "0")
+    expected = _evaluate(tmp_path / "whole", tmp_path, *options)["results"]
+    assert _evaluate(tmp_path / "whole", tmp_path, *on_the_robot)["results"] == expected
+    of_raw = _evaluate(tmp_path / "model.zip", tmp_path, *options)["results"]
+    assert of_raw == without["results"], "what was raw in training stays raw, whatever else the file has"
+
+
+@pytest.mark.parametrize("suffix", [".onnx", ".pt"])
+def test_exported_files_take_images_as_the_environment_shows_them(suffix, tmp_path):
+    if suffix == ".onnx":
+        pytest.importorskip("onnx", reason="writes the exported file")
+        pytest.importorskip("onnxruntime", reason="runs the exported file")
+    shown = spaces.Dict(partial=spaces.Box(0, 255, (36, 40, 3), np.uint8), privileged=spaces.Box(-1, 1, (1,), np.float32))
+    model = small_model(Sampled(shown), policy_kwargs={"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}})
+    policy = load_exported(export_learner(model, tmp_path / f"learner{suffix}", verify_on=4))
+    images = np.stack([shown["partial"].sample() for _ in range(3)])
+    policy.start(3)
+    actions = policy.act({"partial": images}, np.ones(3, bool))
+    np.testing.assert_allclose(actions, model.predict({"partial": images}, deterministic=True)[0], atol=1e-5)
 
 
 def test_what_is_wrong_is_said_before_anything_is_run(gac, tmp_path, monkeypatch):
@@ -195,13 +236,30 @@ def test_what_is_wrong_is_said_before_anything_is_run(gac, tmp_path, monkeypatch
         (gac, "--env", "sb3_gac/HalfCheetha-v5"): "HalfCheetha",
         (gac, *NOISY[:2], "--env-kwargs", "{histroy: 2}"): "--env-kwargs: .*noisy_walk can't be made .*'histroy'",
         (gac, "--env", "sb3_gac/Hopper-v5", "--env-kwargs", "{histroy: 2}"): "--env-kwargs: .*'histroy'",
-        (gac, *NOISY, "--out", tmp_path / "other.pt"): "--out: the folder .* can't be made",
-        (gac, *NOISY, "--out", tmp_path / "other.pt" / "below"): "--out: the folder .* can't be made",
+        (gac, *NOISY, "--out", tmp_path / "other.pt"): "--out: nothing can be written in the folder",
+        (gac, *NOISY, "--out", tmp_path / "other.pt" / "below"): "--out: nothing can be written in the folder",
         (gac, *NOISY, "--vec-normalize", tmp_path / "other.pt"): "the model was trained without VecNormalize",
     }
     for arguments, message in wrong.items():
         with pytest.raises(SystemExit, match=message):
             main([*map(str, arguments)])
+
+
+def test_a_folder_that_takes_no_files_is_refused_before_anything_is_run(gac, tmp_path, monkeypatch):
+    def full(**options):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("sb3_gac.evaluate.run_episodes", None)
+    monkeypatch.setattr("sb3_gac.evaluate.TemporaryFile", full)
+    with pytest.raises(SystemExit, match=r"--out: nothing can be written in the folder .*: .*Read-only"):
+        _evaluate(gac, tmp_path, *NOISY, "--noise", "0")
+
+
+def test_what_can_not_be_saved_is_said_in_a_line_below_the_table(gac, tmp_path, capsys):
+    (tmp_path / "evaluation.json").mkdir()
+    with pytest.raises(SystemExit, match=r"Not all could be saved: .*evaluation\.json"):
+        main([str(gac), "--out", str(tmp_path), "--episodes", "1", *NOISY, "--noise", "0"])
+    assert "95% of the mean" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("content", ["", "[1]", "run: 3", "lr: 0.1", "task: {", "environment: {name: Hopper}"])
@@ -247,7 +305,10 @@ def test_choices_are_actions_too():
 
 @pytest.mark.parametrize(
     "options",
-    [["--episodes", "0"], ["--env-kwargs", "4"], ["--env-kwargs", "{a: ["], ["--delay", "0.5"], ["--noise"], ["--seed", "-1"]],
+    [
+        *(["--episodes", "0"], ["--env-kwargs", "4"], ["--env-kwargs", "{a: ["], ["--delay", "0.5"], ["--noise"]),
+        *(["--seed", "-1"], ["--video", "worst"], ["--video", "worst.png"]),
+    ],
 )
 def test_the_option_that_is_wrong_is_named(options, capsys):
     with pytest.raises(SystemExit):

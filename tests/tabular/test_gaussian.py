@@ -115,3 +115,12 @@ def test_a_target_beyond_the_best_action_is_refused():
     learner, std, curvature, best = _case(0)
     with pytest.raises(ValueError, match="target_kl"):
         coefficient_for(2 * _kl(best, learner, std), learner, std, curvature, best)
+
+
+@pytest.mark.parametrize(("target_kl", "scale"), [(1e-30, 1.0), (1e-3, 1e15), (1e-3, 1e-15)])
+def test_a_target_may_need_an_alpha_of_any_size(target_kl, scale):
+    learner, std, curvature, best = _case(0)
+    alpha = coefficient_for(target_kl, learner, std, scale * curvature, best)
+    assert _kl(guider_optimum(alpha, learner, std, scale * curvature, best), learner, std) == pytest.approx(
+        target_kl, rel=1e-6
+    )

@@ -80,3 +80,17 @@ def test_the_two_differ_in_whose_values_they_take(seed, alpha):
     assert np.abs(mpos - guided_values(process, alpha, guider, learner)).max() > 1e-4
     agreed = process.by_state(learner)
     np.testing.assert_allclose(guided_values(process, alpha, agreed, learner), mpos, atol=1e-9)
+
+
+def test_actions_that_the_old_learner_never_takes_do_not_count_in_the_objectives():
+    process, _, learner, _ = random_pair(0, aggregated=True)
+    values, weights = action_values(process, process.by_state(learner)), np.ones(STATES)
+    never = np.array([[0.0, 0.4, 0.6]] * len(learner))
+    seen = process.by_state(never)
+    by_hand = weights @ (seen[:, 1:] * np.exp(values[:, 1:]) * np.log(seen[:, 1:])).sum(axis=1)
+    assert likelihood_objective(process, 1.0, never, values, weights, never) == pytest.approx(by_hand)
+    assert mpo_objective(process, 1.0, 2.0, never, values, weights, never) == pytest.approx(by_hand)
+    assert mpo_objective(process, 1.0, 2.0, learner, values, weights, never) == -np.inf
+    for function, arguments in ((learner_by_mpo, (0.0, 1.0)), (learner_by_mpo, (1.0, -1.0)), (learner_by_likelihood, (0.0,))):
+        with pytest.raises(ValueError, match=r"^(temperature|penalty|alpha) must"):
+            function(process, *arguments, learner, values, weights)

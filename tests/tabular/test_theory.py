@@ -7,7 +7,10 @@ import pytest
 from hypothesis import given, settings
 
 from sb3_gac.tabular import (
+    DISTILLATION,
+    OWN_CRITIC,
     TabularPOMDP,
+    action_values,
     augmented_rewards,
     divergence,
     expected_return,
@@ -18,6 +21,8 @@ from sb3_gac.tabular import (
     improved_guider,
     improved_learner,
     learner_by_likelihood,
+    learner_by_mpo,
+    tiger_door,
     uniform_learner,
     visits,
 )
@@ -60,6 +65,20 @@ def test_lemma_3_1_needs_a_learner_that_may_do_what_the_guider_does():
     process, guider, learner, _ = random_pair(0, aggregated=True)
     learner[0] = [0.0, 0.5, 0.5]
     assert (guided_values(process, 1.0, guider, learner) == -np.inf).any()
+
+
+def test_lemma_3_1_what_the_learner_may_not_do_costs_nothing_where_the_guider_does_not_come():
+    """The guider opens the left door; it never hears the right one, where the learner would not open the left."""
+    process, guider = tiger_door(), np.eye(3)[[0, 0, 0, 0]]
+    learner = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 1.0, 0.0]])
+    heard_left = -0.1 + 1.0 - 0.1 * np.log(2)
+    values = np.array([[1.0, 0.0, heard_left], [0.0, 1.0, -np.inf]] * 2)
+    np.testing.assert_allclose(guided_values(process, 0.1, guider, learner), values)
+    np.testing.assert_allclose(guided_backup(process, 0.1, guider, learner, values), values)
+    assert guided_objective(process, 0.1, guider, learner) == pytest.approx(0.5)
+    rewards = augmented_rewards(process, 0.1, guider, learner)
+    np.testing.assert_allclose(rewards[:, 2], [-0.1 - 0.1 * np.log(2), -np.inf] * 2)
+    np.testing.assert_allclose(guided_values(process, 0.0, guider, learner), action_values(process, guider))
 
 
 @FEW
@@ -228,10 +247,40 @@ def test_eq_17_as_printed_can_only_grow():
 
 def test_what_is_no_iteration_is_refused_by_name():
     process = random_process(np.random.default_rng(0), aggregated=True)
-    with pytest.raises(ValueError, match="alpha"):
-        guided_policy_iteration(process, 0.0)
+    for alpha in (0.0, -1.0, 1e-310, np.inf, np.nan):
+        with pytest.raises(ValueError, match="alpha must"):
+            guided_policy_iteration(process, alpha)
     with pytest.raises(ValueError, match="step"):
         guided_policy_iteration(process, 1.0, step="teacher")
+    with pytest.raises(ValueError, match="learner must"):
+        guided_policy_iteration(process, 1.0, np.ones((2, ACTIONS)))
+    with pytest.raises(ValueError, match="weights must"):
+        guided_policy_iteration(process, 1.0, weights=-np.ones(STATES))
+
+
+@pytest.mark.parametrize("step", [DISTILLATION, OWN_CRITIC])
+@pytest.mark.parametrize("alpha", [1e-300, 1e-20, 1e-3, 1e20, 1e300])
+def test_an_alpha_of_any_size_has_an_iteration(alpha, step):
+    process = tiger_door()
+    for now in islice(guided_policy_iteration(process, alpha, step=step), 6):
+        for policy in (now.guider, now.learner):
+            np.testing.assert_allclose(policy.sum(axis=1), 1.0)
+        assert np.isfinite(guided_objective(process, alpha, now.guider, now.learner))
+        assert np.isfinite(now.values).all()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e-307])
+@pytest.mark.parametrize("normalised", [False, True])
+def test_the_learners_steps_do_not_overflow_where_values_differ_much(scale, normalised):
+    """One observation's values are all far below another's."""
+    process, values = tiger_door(), np.array([[5.0, 4.0, 3.0], [4.0, 5.0, 3.0], [-5.0, -6.0, -6.0], [-6.0, -5.0, -6.0]])
+    uniform, weights = uniform_learner(process), np.ones(4)
+    best = np.array([[0.5, 0.5, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    new = learner_by_likelihood(process, scale, uniform, values, weights, normalised)
+    np.testing.assert_allclose(new, best, atol=1e-12)
+    np.testing.assert_allclose(learner_by_mpo(process, scale, 0.0, uniform, values, weights), best, atol=1e-12)
+    stays = np.vstack([best[:1], uniform[1:]])  # exp of values far below 0 is nothing beside the penalty
+    np.testing.assert_allclose(learner_by_mpo(process, scale, 0.1, uniform, values, weights), stays, atol=1e-12)
 
 
 def test_the_objective_of_an_iterate_is_that_of_its_values():

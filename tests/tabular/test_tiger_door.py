@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sb3_gac.tabular import (
     OWN_CRITIC,
+    TabularPOMDP,
     action_values,
     expected_return,
     guided_objective,
@@ -168,3 +169,16 @@ def test_with_little_alpha_the_own_critic_alone_is_followed():
     new = learner_by_own_critic(process, 1e-6, process.by_state(OPEN_AT_ONCE), own, np.ones(4))
     best = process.by_observation(own, np.ones(4)).argmax(axis=1)
     np.testing.assert_allclose(new, np.eye(3)[best], atol=1e-4)
+
+
+@pytest.mark.parametrize("alpha", [1e-300, 1e-20, 1e-8, 1.0, 1e6, 1e300])
+@pytest.mark.parametrize("imitated", [[1e-12, 0.0, 1 - 1e-12], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.5, 0.5, 0.0]])
+@pytest.mark.parametrize("critic", [[1.0, 1.0, 0.0], [1e3, 0.0, 0.0], [-1e6, -1e6 + 1e-6, 0.0]])
+def test_eq_16_of_any_size_is_a_policy_that_loses_at_most_alpha(alpha, imitated, critic):
+    process = TabularPOMDP(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.array([0]), np.array([1.0]), gamma=0.9)
+    (new,) = learner_by_own_critic(process, alpha, np.array([imitated]), np.array([critic]), np.ones(1))
+    assert new.min() >= 0.0
+    assert new.sum() == pytest.approx(1.0, abs=1e-12)
+    assert max(critic) - new @ critic <= alpha * (1 + 1e-9) + 1e-9 * np.abs(critic).max()
+    can_be_held = np.array(imitated) * alpha > 1e-290
+    assert (new[can_be_held] > 0).all()  # so that no KL of the guider is infinite

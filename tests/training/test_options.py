@@ -4,6 +4,7 @@ import re
 import sys
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 import yaml
@@ -16,7 +17,7 @@ from sb3_gac.training.directory import in_words, new_directory
 from sb3_gac.training.environments import find_modules_here
 from sb3_gac.training.job import open_environments, prepare
 from sb3_gac.training.options import DEFAULTS, algorithm_arguments, make_parser
-from tests.helpers import TwoViewBandit
+from tests.helpers import Sampled, TwoViewBandit
 
 OWN = "tests.training.test_options:make_own"
 
@@ -26,6 +27,12 @@ def make_own(mass=1.0):
     env = TwoViewBandit()
     env.mass = mass
     return env
+
+
+def make_geared():
+    """One with a third entry."""
+    shown = {name: spaces.Box(-1, 1, (2,), np.float32) for name in ("partial", "privileged")}
+    return Sampled(spaces.Dict(**shown, gear=spaces.Discrete(3)))
 
 
 def make_foreign():

@@ -14,6 +14,7 @@ from sb3_gac import stopping
 from sb3_gac.stopping import command, started_as
 
 ROOT = Path(__file__).parents[2]
+PACKAGES = {"sb3_gac.envs": "sb3_gac.envs.__main__", "sb3_gac.deploy": "sb3_gac.deploy.__main__"}
 
 
 @pytest.mark.parametrize(
@@ -40,6 +41,7 @@ def test_the_main_job_is_told_from_other_programs(words, start, monkeypatch):
     [
         (["python", "-m", "sb3_gac.train"], True),
         (["python", "-m", "sb3_gac.evaluate", "model.zip"], True),
+        (["python", "-m", "sb3_gac.envs"], True),
         (["python", "/venv/bin/sb3-gac", "evaluate"], True),
         (["python", "mine.py"], False),
         (["python", "-m", "mine", "-m", "sb3_gac.train.py"], False),
@@ -67,13 +69,13 @@ def _interrupted(tmp_path, program, *options, module="sb3_gac.train"):
     """
     prelude = f"import os, signal, sys\nsys.orig_argv = ['python', '-m', {module!r}]\nsys.path.insert(0, {str(ROOT)!r})\n"
     prelude += "def interrupt(*args, **kwargs):\n    os.kill(os.getpid(), signal.SIGINT)\n"
-    start = f"\nfrom {module} import main\nmain({list(options)!r})"
+    start = f"\nfrom {PACKAGES.get(module, module)} import main\nmain({list(options)!r})"
     return subprocess.run(
         [sys.executable, "-c", prelude + program + start], cwd=tmp_path, capture_output=True, text=True, check=False
     )
 
 
-@pytest.mark.parametrize("module", ["sb3_gac.train", "sb3_gac.evaluate"])
+@pytest.mark.parametrize("module", ["sb3_gac.train", "sb3_gac.evaluate", "sb3_gac.envs", "sb3_gac.deploy"])
 def test_while_other_libraries_are_imported(module, tmp_path):
     finder = "class Finder:\n    def find_spec(name, *args):\n        if name == 'gymnasium':\n            interrupt()\n"
     finder += "sys.meta_path.insert(0, Finder)\n"
