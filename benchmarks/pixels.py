@@ -8,6 +8,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.torch_layers import CombinedExtractor
 
 import sb3_gac
 from benchmarks.contenders import alternate, timer
@@ -75,7 +77,8 @@ def compare_image_steps(name: str, steps: int, rounds: int) -> dict[str, Any]:
     :param steps: gradient steps in a block
     :param rounds: number of blocks of each contender
     :return: gradient steps per second with the preset ``pixels`` on one thread; the shares of their time that sampling and
-        random shifts take; and the replay buffer's bytes and sampling time as multiples of those of SB3's
+        random shifts take; and, as multiples of SB3's, the time of the encoder with its gradient, the bytes of the
+        replay buffer and its sampling time
     """
     th.set_num_threads(1)
     options = sb3_gac.preset("pixels", algorithm=name) | {"buffer_size": CAPACITY, "learning_starts": 10**9}
@@ -89,11 +92,16 @@ def compare_image_steps(name: str, steps: int, rounds: int) -> dict[str, Any]:
         images[:] = 1  # reading memory that was never written to takes no time
     arrays = [*twice.observations.values(), *twice.next_observations.values()]
     arrays += [twice.actions, twice.rewards, twice.dones, twice.timeouts]
+    actor = model.policy.deployed
+    seen = {"partial": samples.observations["partial"]}
+    in_sb3 = CombinedExtractor(actor.observation_space, actor.features_extractor.features_dim)
     timers = {
         "step": timer(lambda: model.train(1, batch)),
         "sample": timer(lambda: model.replay_buffer.sample(batch)),
         "sb3": timer(lambda: twice.sample(batch)),
         "shift": timer(lambda: shifted(samples, ["partial"], model.random_shift)),
+        "encoder": timer(lambda: actor.extract_features(seen, actor.features_extractor).sum().backward()),
+        "sb3s encoder": timer(lambda: in_sb3(preprocess_obs(seen, actor.observation_space)).sum().backward()),
     }
     median = {each: float(np.median(values)) for each, values in alternate(timers, repetitions=steps, rounds=rounds).items()}
     return {
@@ -102,6 +110,7 @@ def compare_image_steps(name: str, steps: int, rounds: int) -> dict[str, Any]:
         "gradient_steps_per_second": round(1 / median["step"], 2),
         "sampling_share": round(median["sample"] / median["step"], 3),
         "shift_share": round(median["shift"] / median["step"], 3),
+        "encoder_time_over_sb3": round(median["encoder"] / median["sb3s encoder"], 3),
         "bytes_over_sb3": round(model.replay_buffer.nbytes() / sum(array.nbytes for array in arrays), 3),
         "sampling_time_over_sb3": round(median["sample"] / median["sb3"], 2),
     }

@@ -140,7 +140,7 @@ def encode(values: th.Tensor, space: spaces.Space, normalize_images: bool) -> th
         return th.cat([_one_hot(column, n, start) for column, (n, start) in zip(columns, choices, strict=True)], dim=-1)
     if space.shape == ():
         return values.float().unsqueeze(-1)
-    return values.float() / 255.0 if normalize_images and _is_image(space) else values.float()
+    return (values / 255.0).float() if normalize_images and _is_image(space) else values.float()
 
 
 @th.compiler.assume_constant_result

@@ -72,6 +72,19 @@ class EntryExtractor(CombinedExtractor):
         """
         return th.cat([self.extractors[name](observations[key]) for key, name in self._names.items()], dim=1)
 
+    @staticmethod
+    def laid_out(observations: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
+        """
+        Put the channels of images side by side in memory, where an image encoder takes half the time on CPUs.
+
+        Encoders of users get images in SB3's order, since ``view`` fails in any other.
+
+        :param observations: (B, ...) of each entry
+        :return: the same values in the same shapes
+        """
+        order = th.channels_last
+        return {key: one.contiguous(memory_format=order) if one.dim() == 4 else one for key, one in observations.items()}
+
 
 class LatentExtractor(BaseFeaturesExtractor):
     """

@@ -7,7 +7,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gac.checks.entries import encode, leading_dimensions
-from sb3_gac.networks.encoders import VectorExtractor
+from sb3_gac.networks.encoders import EntryExtractor, VectorExtractor
 from sb3_gac.networks.recurrent import Memory
 
 
@@ -48,6 +48,8 @@ class RoleModel(BaseModel):
         leading = list(value.shape[: 2 if self.memory is not None else leading_dimensions(value, space[key])])
         if len(leading) > 1:  # encoders know one leading dimension, sequences have two
             entries = {key: value.flatten(0, 1) for key, value in entries.items()}
+        if isinstance(extractor, EntryExtractor):
+            entries = extractor.laid_out(entries)
         features = extractor({key: encode(value, space[key], self.normalize_images) for key, value in entries.items()})
         # Reshaped, not unflattened: ONNX would fix unflatten to the batch size of the example
         return features.reshape(*leading, -1) if len(leading) > 1 else features
