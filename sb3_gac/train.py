@@ -18,7 +18,6 @@ from collections.abc import Sequence
 
 from sb3_gac.stopping import INTERRUPTED, last_words
 from sb3_gac.training.directory import options_of, summary
-from sb3_gac.training.evaluation import entries_read_by
 from sb3_gac.training.job import prepare, run
 from sb3_gac.training.options import given_options, make_parser, resolve
 from sb3_gac.training.progress import warnings_in_a_line
@@ -72,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except Exception:
         _say_how_to_go_on()
         raise
-    print(summary(job.directory, options, entries_read_by(job.model)))
+    print(summary(job.directory, options, job.model.policy.deployed_entries))
 
 
 def _say_how_to_go_on() -> None:

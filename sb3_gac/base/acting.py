@@ -30,6 +30,11 @@ class ActingPolicy(BoundedPolicy):
         """The policy that acts at evaluation."""
         return getattr(self, self.roles.deployed)
 
+    @property
+    def deployed_entries(self) -> tuple[str, ...]:
+        """Observation entries that the deployed policy reads."""
+        return self.role_keys[self.roles.deployed]
+
     def check_seen_by(self, role: str, observation: Any, where: str) -> None:
         """
         Check that an observation has all entries that a policy needs to act.
@@ -39,14 +44,14 @@ class ActingPolicy(BoundedPolicy):
         :param where: name of the method that was called, for the message
         :raises ValueError: if an entry is missing that the role's policy reads, or the deployed one, which runs beside it
         """
-        reads = list(dict.fromkeys([*self.role_keys[role], *self.role_keys[self.roles.deployed]]))
+        reads = list(dict.fromkeys([*self.role_keys[role], *self.deployed_entries]))
         if not isinstance(observation, Mapping):
             raise ValueError(f"The {role} reads {reads}: pass {where} a dict with these entries, not an array.")
         missing = [key for key in reads if key not in observation]
         if missing:
             raise ValueError(
                 f"The observation passed to {where} lacks {missing}, which the {role} reads; it has {list(observation)}. "
-                f"predict() is for observations of {list(self.role_keys[self.roles.deployed])} alone."
+                f"predict() is for observations of {list(self.deployed_entries)} alone."
             )
 
     def acting_distributions(self, outputs: Mapping[str, Any]) -> Mapping[str, Any]:

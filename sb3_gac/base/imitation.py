@@ -98,7 +98,7 @@ def _check_scale(name: str, model: BaseAlgorithm, env: VecEnv, guides: bool = Fa
     policy: Any = model.policy
     entries = list(policy.observation_space.spaces)
     if isinstance(policy, AsymmetricPolicy):
-        entries = list(policy.role_keys[policy.roles.behaviour if guides else policy.roles.deployed])
+        entries = list(policy.role_keys[policy.roles.behaviour] if guides else policy.deployed_entries)
     check_same_scale(name, entries, entries_normalised_in_training(model), env)
 
 
@@ -203,7 +203,7 @@ def _as_tensors(policy: AsymmetricPolicy, demonstrations: Demonstrations) -> tup
     """The entries that the deployed policy reads, and the actions in its own range, [-1, 1], or numbers of discrete ones."""
     if len(demonstrations) < 2:
         raise ValueError(f"demonstrations must be at least two, got {len(demonstrations)}.")
-    keys = policy.role_keys[policy.roles.deployed]
+    keys = policy.deployed_entries
     missing = [key for key in keys if key not in demonstrations.observations]
     if missing:
         raise ValueError(

@@ -289,18 +289,18 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
 
     def _sees_deployed(self, role: str) -> bool:
         """Whether the role reads any of the deployed policy's entries."""
-        return not set(self.role_keys[role]).isdisjoint(self.role_keys[self.roles.deployed])
+        return not set(self.role_keys[role]).isdisjoint(self.deployed_entries)
 
     def _check_sharing(self) -> None:
         others = [role for role in self.roles.others if self.has(role)]
         if self.share_features_extractor and not any(map(self._sees_deployed, others)):
             raise ValueError(
                 f"share_features_extractor=True would do nothing, since none of {others} reads the {self.roles.deployed}'s "
-                f"entries {list(self.role_keys[self.roles.deployed])}: leave it out, or name them in role_keys."
+                f"entries {list(self.deployed_entries)}: leave it out, or name them in role_keys."
             )
 
     def _keys_beside_the_deployed(self, role: str) -> list[str]:
-        shared = self.role_keys[self.roles.deployed]
+        shared = self.deployed_entries
         keys = [key for key in self.role_keys[role] if key not in shared]
         if not keys or not set(shared) < set(self.role_keys[role]):
             raise ValueError(

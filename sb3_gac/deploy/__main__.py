@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _export(options: argparse.Namespace, units: dict[str, str]) -> str:
     file = model_file(options.model)
     model = load_model(file, device="cpu")
-    reads = model.policy.role_keys[model.policy.roles.deployed]
+    reads = model.policy.deployed_entries
     normalizer = normalizer_of(model, file, options.vec_normalize, reads)
     path = export_learner(model, options.out, normalizer, units)
     policy = f"the deployed policy of {type(model).__name__}, which reads {' and '.join(reads)}"

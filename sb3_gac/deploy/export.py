@@ -151,7 +151,7 @@ def export_learner(
 
 def _normalizer_of(model: AsymmetricAlgorithm) -> DeploymentNormalizer | None:
     vec_normalize = model.get_vec_normalize_env()
-    keys = model.policy.role_keys[model.policy.roles.deployed]
+    keys = model.policy.deployed_entries
     if vec_normalize is None and not set(keys).isdisjoint(entries_normalised_in_training(model) or ()):
         raise ValueError(
             "The model learned from observations that VecNormalize normalised, but was loaded without it: load it with "

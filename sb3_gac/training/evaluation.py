@@ -1,6 +1,5 @@
 """Evaluation of a finished run: the learner as it is deployed, beside random actions."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,15 +7,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 EVAL_SEED = 10_000
-
-
-def entries_read_by(model: Any) -> Sequence[str]:
-    """
-    :param model: model of one of this package's algorithms
-    :return: entries that its deployed policy reads
-    """
-    entries: Sequence[str] = model.policy.role_keys[model.policy.roles.deployed]
-    return entries
 
 
 class DeployedView:
@@ -27,7 +17,7 @@ class DeployedView:
     """
 
     def __init__(self, model: Any):
-        self._model, self._entries = model, entries_read_by(model)
+        self._model, self._entries = model, model.policy.deployed_entries
 
     def predict(self, observation: dict[str, np.ndarray], *args: Any, **kwargs: Any) -> Any:
         """The model's actions on these entries, with the arguments and result of the model's ``predict``."""
