@@ -67,7 +67,7 @@ def test_the_learner_is_evaluated_on_what_it_reads_alone(entries):
     seen = []
 
     class Model:
-        policy = SimpleNamespace(role_keys={"learner": entries}, roles=SimpleNamespace(deployed="learner"))
+        policy = SimpleNamespace(deployed_entries=entries)
 
         def predict(self, observation, *args, **kwargs):
             seen.append(observation)
@@ -379,7 +379,7 @@ def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_pat
         asked.append((type(policy).__name__, n_eval_episodes, env.seeds.pop()))
         return {"DeployedView": (1.0, 2.0), "UniformActions": (3.0, 4.0)}[asked[-1][0]]
 
-    policy = SimpleNamespace(role_keys={"learner": ["partial", "gear"]}, roles=SimpleNamespace(deployed="learner"))
+    policy = SimpleNamespace(deployed_entries=["partial", "gear"])
     model = SimpleNamespace(save=Path.touch, num_timesteps=7, compiles=True, learning_starts=5, policy=policy)
     space = SimpleNamespace(seed=lambda seed: None)
     seeds, drawn = [], []
