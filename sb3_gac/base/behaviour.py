@@ -10,7 +10,8 @@ from sb3_gac.base.roles import Roles
 from sb3_gac.checks.values import check_choice
 from sb3_gac.schedules import as_schedule
 
-#: A policy's name; or name -> share, a number or a schedule (which may be text), where the default policy has the remainder
+#: A policy's name; or name -> share, a number or a schedule (which may be text). The remainder is that of the policy that
+#: collects by default, or of the deployed policy where the former has a share itself
 BehaviourSpec: TypeAlias = str | Mapping[str, float | str | Schedule] | None
 
 
@@ -24,13 +25,16 @@ class Behaviour:
     :param per: unit of the shares: "episode", where a policy is drawn at each episode's start, or "environment", where each
         policy has a fixed part of the environments
     :param frozen: names of frozen policies, which may act as well
-    :raises ValueError: if a name is no policy's, or shares are not from 0 to 1
+    :raises ValueError: if a name is no policy's, if shares are not from 0 to 1, or if they sum up to less than 1 and no policy
+        is left for the remainder
     """
 
     def __init__(self, roles: Roles, behaviour: BehaviourSpec, per: str = "episode", frozen: Sequence[str] = ()):
         self.default = behaviour if isinstance(behaviour, str) else roles.behaviour
         shares = behaviour if isinstance(behaviour, Mapping) else {}
         self.shares: dict[str, Any] = {role: _read_share(role, share) for role, share in shares.items()}
+        left = [role for role in (self.default, roles.deployed) if role not in self.shares]
+        self.remainder: str | None = left[0] if left else None
         self.per = per
         for role in (self.default, *self.shares):
             check_choice("behaviour: a policy", role, (*roles.policies, *frozen))
@@ -47,7 +51,7 @@ class Behaviour:
 
     def _share_of(self, role: str, progress_remaining: float) -> float:
         shares = self.shares_at(progress_remaining)
-        return shares.get(role, 0.0) + (1.0 - sum(shares.values()) if role == self.default else 0.0)
+        return shares.get(role, 0.0) + (1.0 - sum(shares.values()) if role == self.remainder else 0.0)
 
     def shares_at(self, progress_remaining: float) -> dict[str, float]:
         """
@@ -55,11 +59,13 @@ class Behaviour:
 
         :param progress_remaining: fraction of training that remains, from 1 to 0
         :return: role -> share, for each policy that was given one
-        :raises ValueError: if a share is not from 0 to 1, or their sum is above 1
+        :raises ValueError: if a share is not from 0 to 1, or their sum above 1, or below 1 without a policy for the remainder
         """
         now = {role: float(share(progress_remaining) if callable(share) else share) for role, share in self.shares.items()}
         if not (all(0 <= share <= 1 for share in now.values()) and sum(now.values()) <= 1 + 1e-9):
             raise ValueError(f"behaviour must be shares from 0 to 1 that sum up to 1 at most, got {now}.")
+        if self.shares and self.remainder is None and sum(now.values()) < 1 - 1e-9:
+            raise ValueError(f"behaviour must be shares that sum up to 1, as no policy is left for the remainder; got {now}.")
         return now
 
     def choose(self, acting: Sequence[str], episode_start: np.ndarray, progress_remaining: float) -> list[str]:
@@ -77,7 +83,8 @@ class Behaviour:
         names, limits = list(shares), np.cumsum(list(shares.values()))
         n_envs = len(episode_start)
         drawn = np.random.rand(n_envs) if self.per == "episode" else (np.arange(n_envs) + 0.5) / n_envs
-        chosen = [next((name for name, limit in zip(names, limits, strict=True) if u < limit), self.default) for u in drawn]
+        rest = self.remainder or names[-1]  # the last one's limit may be rounded to less than 1
+        chosen = [next((name for name, limit in zip(names, limits, strict=True) if u < limit), rest) for u in drawn]
         return [new if starts else old for new, old, starts in zip(chosen, acting, episode_start, strict=True)]
 
 

@@ -56,6 +56,30 @@ def test_a_share_may_be_a_schedule():
     assert behaviour.choose(["guider"] * 4, STARTS, 0.0) == ["learner"] * 4
 
 
+@pytest.mark.parametrize("per", ["episode", "environment"])
+def test_what_the_collecting_policy_leaves_of_its_share_is_the_deployed_policys(per):
+    behaviour = Behaviour(ROLES, {"guider": "linear 1 -> 0"}, per)
+    assert behaviour.choose(["learner"] * 4, STARTS, 1.0) == ["guider"] * 4
+    assert behaviour.choose(["guider"] * 4, STARTS, 0.0) == ["learner"] * 4
+    half = behaviour.choose(["guider"] * 400, np.ones(400, dtype=bool), 0.5)
+    assert half.count("learner") == pytest.approx(200, abs=50 if per == "episode" else 0)
+    assert half.count("learner") + half.count("guider") == 400
+    assert behaviour.acts("learner")
+    assert not Behaviour(ROLES, {"guider": 1.0}).acts("learner")
+
+
+@pytest.mark.parametrize("per", ["episode", "environment"])
+def test_shares_of_all_policies_sum_up_to_one(per):
+    thirds = {"guider": 1 / 3, "learner": 1 / 3, "other": 1 / 3}
+    chosen = Behaviour(ROLES, thirds, per).choose(["guider"] * 300, np.ones(300, dtype=bool), 1.0)
+    assert {role: chosen.count(role) for role in thirds} == pytest.approx(dict.fromkeys(thirds, 100), abs=45)
+    for shares in ({"guider": 0.5, "learner": 0.25}, {"guider": 0.5, "learner": lambda left: left / 2}):
+        with pytest.raises(ValueError, match=r"sum up to 1, as no policy is left for the remainder; got \{'guider': 0.5"):
+            Behaviour(ROLES, shares, per).shares_at(0.5)
+    with pytest.raises(ValueError, match="no policy is left"):
+        small_model(cls=AsymmetricSAC, behaviour={"actor": 0.5})
+
+
 @pytest.mark.parametrize("shares", [{"learner": 1.2}, {"learner": -0.1}, {"learner": 0.6, "other": 0.6}])
 def test_shares_that_are_none_are_refused(shares):
     with pytest.raises(ValueError, match="behaviour must be shares from 0 to 1"):
