@@ -33,6 +33,7 @@ from benchmarks.finished import (
     read_reused,
     settings_of,
 )
+from benchmarks.run_checks import check_finite, with_equal_returns
 from benchmarks.suite import HERE, RUNS, needed_steps, read_cells
 from benchmarks.tidy import CELL, NAMES, NEEDED, NO_NOISE, file_of, normalised_scores, read_tidy, run_scores, significant
 
@@ -78,25 +79,6 @@ def collect(runs: list[FinishedRun]) -> pd.DataFrame:
     frames = [run.evaluations.assign(**names_of(run.spec), **of_needed[run.name]) for run in runs]
     tidy = pd.concat(frames, ignore_index=True)
     return tidy[[*NAMES, *(column for column in tidy.columns if column not in NAMES)]]
-
-
-def check_finite(runs: Sequence[FinishedRun]) -> None:
-    """
-    :param runs: records of finished runs
-    :raises ValueError: naming a run and an evaluation whose return, or whose KL over its target, is no number to average
-    """
-    for run in runs:
-        rows = run.evaluations
-        numbers = {name: rows[name] for name in ("learner", "guider") if name in rows}
-        if {"kl", "target_kl"} <= set(rows):
-            numbers["kl / target_kl"] = rows.kl / rows.target_kl
-        for name, values in numbers.items():
-            wrong = np.isinf(values) if name != "learner" else ~np.isfinite(values)  # others may be missing at first
-            if wrong.any():
-                where = f"{run.name}, after {rows.timesteps[wrong].iloc[0]:,} steps"
-                raise ValueError(
-                    f"{where}: {name} is {values[wrong].iloc[0]}: make the run again, or leave it out of the suite."
-                )
 
 
 def choose_reference(algorithms: list[str], wanted: str | None = None) -> str:
@@ -313,10 +295,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = collect(runs).replace({"noise": {NO_NOISE: np.nan}})
     table.to_csv(evaluations, index=False, float_format="%.6g")
     tidy = read_tidy(evaluations)  # so that the scores can be computed from the file to the last digit
+    equal = with_equal_returns(tidy)
+    if equal:
+        print("\n".join(equal), file=sys.stderr)
     results = {
         "command": command(options),
         **origins(runs),
         "still_to_run": missing,
+        "equal_returns": equal,
         "reference": reference,
         "cells": summarise_cells(tidy, reference),
         **compare(tidy),

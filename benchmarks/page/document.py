@@ -31,7 +31,7 @@ def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> 
     body = (
         f"<h1>{html.escape(title)}</h1><p>{html.escape(what_was_compared(results))}</p>"
         f"<ul class=short>{short}</ul>{tabs(drawn)}"
-        f"<h2>Returns</h2>{returns_table(results['cells'])}{_notes()}"
+        f"<h2>Returns</h2>{returns_table(results['cells'])}{_notes(results.get('equal_returns', []))}"
         f"<h2>Over all cells</h2>{overall_table(results)}"
         f"<h2>How it was made</h2>{_origin(results)}{_logs(results['runs'], runs)}"
     )
@@ -94,8 +94,10 @@ def _as_data(plot: Plot) -> dict[str, Any]:
     return {"data": wide["data"], "wide": wide["layout"], "narrow": narrow["layout"], "caption": plot.caption}
 
 
-def _notes() -> str:
+def _notes(equal_returns: Sequence[str]) -> str:
+    equal = "".join(f"<p class=note>{html.escape(sentence)}</p>" for sentence in equal_returns)
     return (
+        f"{equal}"
         "<p class=note>Bold: the highest mean of its cell. The end is the last evaluation. The interval of the mean is by "
         "Student's t. The interquartile mean (IQM), with rliable's bootstrap interval, is shown of more than three seeds: of "
         "fewer it is their mean. A click on a column's name sorts.</p>"

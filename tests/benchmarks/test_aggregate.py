@@ -9,9 +9,10 @@ import pandas as pd
 import pytest
 
 import benchmarks.bootstrap
-from benchmarks.aggregate import check_finite, choose_reference, compare, main, normalised_scores, run_scores, summarise_cells
+from benchmarks.aggregate import choose_reference, compare, main, normalised_scores, run_scores, summarise_cells
 from benchmarks.bootstrap import interval
 from benchmarks.finished import FinishedRun
+from benchmarks.run_checks import check_finite, with_equal_returns
 from benchmarks.suite import RunSpec
 
 
@@ -187,6 +188,24 @@ def test_a_run_whose_numbers_cannot_be_averaged_is_named(change, message):
     rows = pd.DataFrame({"timesteps": [10, 20], "learner": [1.0, 2.0], **change})
     with pytest.raises(ValueError, match=message) if message else nullcontext():
         check_finite([FinishedRun(spec, rows, {}, [], 1.0, 1)])
+
+
+def test_algorithms_with_equal_returns_are_named():
+    """Their settings amount to the same, which their names hide."""
+
+    def found(of_b, of_c=(5.0, 6.0)):
+        runs = [_evaluations("a", seed, [seed, seed + 0.5]) for seed in (0, 3)] + [_evaluations("b", 0, of_b[:2])]
+        runs += [_evaluations("b", 3, of_b[2:]), _evaluations("c", 0, of_c), _evaluations("c", 3, of_c)]
+        return with_equal_returns(pd.concat(runs))
+
+    equal = ["T, noise 0.1: a and b have equal returns in all runs, so their settings amount to the same."]
+    assert found([0.0, 0.5, 3.0, 3.5]) == equal
+    assert found([0.0, 0.5, 3.0, 3.4]) == []
+    won_or_lost = pd.concat([_evaluations(name, seed, [0.0, 1.0]) for name in "ab" for seed in range(3)])
+    assert with_equal_returns(won_or_lost) == []
+    other_tasks = pd.concat([_evaluations("a", 0, [1.0, 2.0]), _evaluations("b", 0, [1.0, 2.0], task="U")])
+    assert with_equal_returns(other_tasks) == []
+    assert with_equal_returns(pd.concat([_evaluations("a", 0, [1.0, 2.0]), _evaluations("b", 1, [1.0, 2.0])])) == []
 
 
 def test_results_are_not_begun_without_their_runs(tmp_path):

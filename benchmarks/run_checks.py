@@ -1,0 +1,50 @@
+"""Checks of finished runs before they are compared: returns that are no numbers, and algorithms that are one and the same."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.finished import FinishedRun
+from benchmarks.tidy import CELL, NO_NOISE
+
+
+def check_finite(runs: Sequence[FinishedRun]) -> None:
+    """
+    :param runs: records of finished runs
+    :raises ValueError: naming a run and an evaluation whose return, or whose KL over its target, is no number to average
+    """
+    for run in runs:
+        rows = run.evaluations
+        numbers = {name: rows[name] for name in ("learner", "guider") if name in rows}
+        if {"kl", "target_kl"} <= set(rows):
+            numbers["kl / target_kl"] = rows.kl / rows.target_kl
+        for name, values in numbers.items():
+            wrong = np.isinf(values) if name != "learner" else ~np.isfinite(values)  # others may be missing at first
+            if wrong.any():
+                where = f"{run.name}, after {rows.timesteps[wrong].iloc[0]:,} steps"
+                raise ValueError(
+                    f"{where}: {name} is {values[wrong].iloc[0]}: make the run again, or leave it out of the suite."
+                )
+
+
+def with_equal_returns(tidy: pd.DataFrame) -> list[str]:
+    """
+    Find algorithms whose settings amount to the same.
+
+    :param tidy: evaluations, see :func:`collect`
+    :return: a sentence for each two algorithms of a cell with the same returns in all evaluations of all seeds that both have;
+        returns of which most occur several times, as in games that are won or lost, may agree by chance, and are left out
+    """
+    found = []
+    for (task, noise), cell in tidy.groupby(CELL, sort=False):
+        returns = cell.pivot_table("learner", ["seed", "timesteps"], "algorithm", sort=False)
+        for one, other in combinations(returns, 2):
+            both = returns[[one, other]].dropna()
+            if (both[one] == both[other]).all() and both[one].nunique() > max(1, len(both) / 2):
+                where = task if noise == NO_NOISE else f"{task}, noise {noise}"
+                found.append(
+                    f"{where}: {one} and {other} have equal returns in all runs, so their settings amount to the same."
+                )
+    return found
