@@ -143,6 +143,8 @@ class TrainedParameters:
             if not state:
                 state["step"] = th.zeros((), device=parameter.device)
                 state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(parameter), th.zeros_like(parameter)
+            for name in ("exp_avg", "exp_avg_sq"):  # a file may have them in another order in memory
+                (state[name],) = in_order_of([parameter], [state[name]])
         states = [self.optimizer.state[parameter] for parameter in parameters]
         learning_rate = th.zeros((), device=self.everything[0].device if self.everything else None)
         counts = th.stack([state["step"] for state in states]) if states else learning_rate.new_zeros(0)
@@ -207,6 +209,7 @@ class TrainedParameters:
         """
         if not gradients:
             return
+        gradients = in_order_of(self.parameters, gradients)
         if scale is not None and any(self.clipped):
             scaled = iter(th._foreach_mul(self._clipped(gradients), scale))
             gradients = [next(scaled) if clips else g for g, clips in zip(gradients, self.clipped, strict=True)]
@@ -219,6 +222,28 @@ class TrainedParameters:
                 for parameter, gradient in zip(self.parameters, gradients, strict=True):
                     parameter.grad = gradient
                 self.optimizer.step()
+
+
+def in_order_of(parameters: Sequence[th.Tensor], values: Sequence[th.Tensor]) -> list[th.Tensor]:
+    """
+    Bring values of parameters into their parameters' order in memory.
+
+    Torch's fused optimisers go through memory and take a value for another element's where the orders differ, as they do for
+    the gradient of a convolution whose input has its channels last. Compiled steps go by index, and need no such order.
+
+    :param parameters: tensors in any order in memory
+    :param values: one tensor for each parameter, of its shape
+    :return: the same values, copied where the order was another
+    """
+    if th.compiler.is_compiling():
+        return list(values)
+    pairs = zip(parameters, values, strict=True)
+    return [value if _order(value) == _order(one) else th.empty_like(one).copy_(value) for one, value in pairs]
+
+
+def _order(tensor: th.Tensor) -> list[int]:
+    """Strides of all dimensions but those of size 1, whose strides mean nothing."""
+    return [stride for stride, size in zip(tensor.stride(), tensor.shape, strict=True) if size > 1]
 
 
 def _is_plain_adam(optimizer: th.optim.Optimizer) -> bool:

@@ -62,6 +62,44 @@ def test_a_step_is_that_of_torchs_adam(optimizer_class, options, compiling, monk
     th.testing.assert_close(ours, theirs)
 
 
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+@pytest.mark.parametrize("bound", [None, 0.5])
+def test_a_gradient_counts_by_index_whatever_its_order_in_memory(options, bound):
+    """Torch's fused optimisers go through memory: they took a value for another element's, without a word."""
+    ours, theirs = (_parameters((3, 2, 4, 5), (2, 3), (2, 1, 4)) for _ in range(2))
+    ours[1].data = ours[1].data.t().contiguous().t()
+    trained, plain = (
+        TrainedParameters(parameters, th.optim.AdamW(parameters, lr=0.1, fused=True, **options))
+        for parameters in (ours, theirs)
+    )
+    for step in range(4):
+        gradients = _gradients(ours, step)
+        moved = [gradients[0].contiguous(memory_format=th.channels_last), *gradients[1:]]
+        assert moved[0].stride() != gradients[0].stride()
+        for network, own in ((trained, moved), (plain, gradients)):
+            network.refresh()
+            network.step(own, None if bound is None else th.tensor(bound))
+    th.testing.assert_close(ours, theirs)
+
+
+def test_moments_of_a_file_count_by_index_whatever_their_order_in_memory():
+    ours, theirs = _parameters((3, 2, 4, 5)), _parameters((3, 2, 4, 5))
+    networks = [TrainedParameters(parameters, th.optim.Adam(parameters, lr=0.1, fused=True)) for parameters in (ours, theirs)]
+    for network in networks:
+        network.refresh()
+        network.step(_gradients(ours, 0))
+    state = networks[0].optimizer.state_dict()
+    for moments in state["state"].values():
+        moments |= {
+            name: value.contiguous(memory_format=th.channels_last) for name, value in moments.items() if value.dim() == 4
+        }
+    networks[0].optimizer.load_state_dict(state)
+    for network in networks:
+        network.refresh()
+        network.step(_gradients(ours, 1))
+    th.testing.assert_close(ours, theirs)
+
+
 @pytest.mark.parametrize("compiling", [False, True])
 def test_a_memory_has_a_learning_rate_of_its_own(compiling, monkeypatch):
     """As with two groups of torch's own, its rate changed on the way."""
