@@ -75,7 +75,7 @@ class EntryExtractor(CombinedExtractor):
     @staticmethod
     def laid_out(observations: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
         """
-        Put the channels of images side by side in memory, where an image encoder takes half the time on CPUs.
+        Put the channels of images side by side in memory, which saves a third of an image encoder's time or more on CPUs.
 
         Encoders of users get images in SB3's order, since ``view`` fails in any other.
 

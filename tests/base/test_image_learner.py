@@ -166,7 +166,7 @@ def _first_input(model, observations):
 
 
 def test_convolutions_get_channels_side_by_side():
-    """Then they take half the time on CPUs; the values are SB3's."""
+    """Then they take less time on CPUs; the values are SB3's."""
     model = _model()
     images = th.randint(0, 256, (5, 6, 36, 36), dtype=th.uint8)
     given, features = _first_input(model, {"partial": images})
