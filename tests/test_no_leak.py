@@ -61,6 +61,7 @@ KINDS = {
     "gru, normalised": lambda: _recurrent("Gru", _normalised()),
     "gru, shared cnn": lambda: _recurrent("Gru", Sampled(IMAGES), CNN | SHARED),
     "lstm": lambda: _recurrent("Lstm", Sampled(VECTORS)),
+    "lru": lambda: _recurrent("", Sampled(VECTORS), {"rnn_type": "lru"}),
     "lstm, discrete": lambda: _recurrent("Lstm", Sampled(VECTORS, CHOICE)),
     "history, two entries": lambda: small_model(History(Sampled(SEVERAL), 3, actions=True), **READS_TWO),
     "gru of the learner alone": lambda: _recurrent("", Sampled(VECTORS), {"rnn_type": {"learner": "gru"}}),
@@ -256,7 +257,7 @@ def test_no_leak(model, check, tmp_path):
     check(model, tmp_path)
 
 
-@pytest.mark.parametrize("model", [kind for kind in KINDS if kind.startswith(("gru", "lstm"))], indirect=True)
+@pytest.mark.parametrize("model", [kind for kind in KINDS if kind.startswith(("gru", "lstm", "lru"))], indirect=True)
 def test_the_learners_memory_in_training_holds_nothing_privileged(model):
     """While the guider acts, the learner's memory goes along, on its own entries."""
     states = []

@@ -63,6 +63,7 @@ SUM = {"kl_reduction": "sum", "target_kl": 0.4}
 CLIPPED = {"max_grad_norm": 0.5}
 N_STEPS = {"n_steps": 3}
 PARTS = {"replay_buffer_kwargs": {"sequence_length": 2, "burn_in": 2}}
+LRU = {"policy_kwargs": {"rnn_type": "lru"}}  # in place of the policy class's GRU
 MASKED = {"replay_buffer_kwargs": {"mask_truncations": True}}
 SOFTPLUS = {"policy_kwargs": {"softplus_min_std": 0.05, "log_std_bounds": LOG_STD_BOUNDS}}
 PAIRS, FOUR = {"critic_groups": 2}, {"policy_kwargs": {"n_critics": 4}}
@@ -163,6 +164,8 @@ CASES = {
     "TGRL, GRU for actors alone": Case(
         TGRL, of_model={"policy_kwargs": {"rnn_type": dict.fromkeys(("actor", "auxiliary"), "gru")}}, cell="Gru"
     ),
+    "LRU": Case(GAC, of_model=LRU, cell="Gru"),
+    "LRU, SAC, parts of episodes, discrete": Case(AsymmetricSAC, of_model=LRU | PARTS, cell="Gru", discrete=True),
     "LSTM, SAC, normalised": Case(AsymmetricSAC, cell="Lstm", normalised=True),
     "COSIL": Case(COSIL),
     "COSIL, clipped, n steps": Case(COSIL, CLIPPED | {"teacher_coef": 0.6}, of_model=N_STEPS),

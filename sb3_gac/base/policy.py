@@ -62,7 +62,8 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
     :param normalize_images: whether to divide images by 255
     :param optimizer_class: class of the optimisers of all networks
     :param optimizer_kwargs: keyword arguments of that class, without the learning rate
-    :param rnn_type: type of the networks' memories, "gru" or "lstm", with which they take sequences; or role -> type, where
+    :param rnn_type: type of the networks' memories, "gru", "lstm" or "lru" (:class:`LinearRecurrentUnit
+        <sb3_gac.networks.linear_recurrent_unit.LinearRecurrentUnit>`), with which they take sequences; or role -> type, where
         "critic" stands for all critics and "partial" for every network that reads ``partial`` alone; ``None`` for the
         default of the policy class
     :param rnn_hidden_size: size of the recurrent layer, which comes after the layers of ``net_arch``

@@ -200,7 +200,7 @@ def resolve_rnn_types(
     Type of memory per role.
 
     :param roles: roles of the algorithm
-    :param rnn_type: "gru", "lstm" or ``None`` for all roles; or role, or "critic" for all critics -> one of these, and
+    :param rnn_type: "gru", "lstm", "lru" or ``None`` for all roles; or role, or "critic" for all critics -> one of these, and
         "partial" -> one of these for every network that reads the entry ``partial`` alone and is not named otherwise
     :param role_keys: role -> entries that it reads, for all networks
     :return: role -> type, or ``None`` for a network without a memory, for all networks

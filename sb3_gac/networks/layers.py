@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Callable
+from typing import TypeVar
 
 import torch as th
 from torch import nn
 
+Output = TypeVar("Output")
+
 INITIALIZATIONS = ("torch", "lecun_uniform")
 
 
-def in_float32(layer: Callable[[th.Tensor], th.Tensor], x: th.Tensor) -> th.Tensor:
+def in_float32(layer: Callable[[th.Tensor], Output], x: th.Tensor) -> Output:
     """
     Apply a layer in float32, also where the layers before it run in mixed precision.
 

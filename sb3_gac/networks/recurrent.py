@@ -1,5 +1,6 @@
 """Memories of networks: the base of all memories, and a recurrent layer with hidden layers before it."""
 
+import functools
 import itertools
 from typing import Any
 
@@ -7,7 +8,8 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_gac.networks.layers import EnsembleLinear
+from sb3_gac.networks.layers import EnsembleLinear, in_float32
+from sb3_gac.networks.linear_recurrent_unit import LinearRecurrentUnit
 
 
 class Memory(nn.Module):
@@ -54,12 +56,46 @@ class Memory(nn.Module):
         return state
 
 
+class GRU(nn.GRU):
+    """Torch's GRU, whose state is its last output."""
+
+    states_per_unit = 1
+
+    def unroll(self, x: th.Tensor, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param x: input of T steps of B sequences, shape (T, B, F)
+        :param state: state before the first step, shape (B, H)
+        :return: outputs, shape (T, B, H), and state after the last step, shape (B, H)
+        """
+        outputs, last = self(x, state[None])
+        return outputs, last[0]
+
+
+class LSTM(nn.LSTM):
+    """Torch's LSTM, whose state is its hidden state and its cell state side by side."""
+
+    states_per_unit = 2
+
+    def unroll(self, x: th.Tensor, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param x: input of T steps of B sequences, shape (T, B, F)
+        :param state: state before the first step, shape (B, 2 H)
+        :return: outputs, shape (T, B, H), and state after the last step, shape (B, 2 H)
+        """
+        outputs, (hidden, inner) = self(x, tuple(part[None].contiguous() for part in state.chunk(2, dim=-1)))
+        return outputs, th.cat([hidden[0], inner[0]], dim=-1)
+
+
+#: Kinds of recurrent layers. An instance takes sizes of input and state; ``unroll`` takes all steps of a batch
+CELLS: dict[str, Any] = {"gru": GRU, "lstm": LSTM, "lru": LinearRecurrentUnit}
+
+
 class RecurrentCore(Memory):
     """
     Hidden layers and then one recurrent layer, for each member of an ensemble. The hidden layers are batched over members;
-    each recurrent layer takes one pass over time.
+    each recurrent layer takes one pass over time, in float32, since errors of a state add up over an episode.
 
-    :param cell: kind of recurrent layer, "gru" or "lstm"
+    :param cell: kind of recurrent layer, a name in ``CELLS``
     :param features_dim: number of input features, F
     :param net_arch: hidden layer sizes before the recurrent layer
     :param hidden_size: size of the recurrent layer, H
@@ -85,7 +121,7 @@ class RecurrentCore(Memory):
         self.hidden = nn.Sequential(*layers)
         width = [features_dim, *net_arch][-1]
         self.cells = nn.ModuleList(CELLS[cell](width, hidden_size) for _ in range(n_members))
-        self.state_size = hidden_size * (2 if cell == "lstm" else 1)
+        self.state_size = hidden_size * CELLS[cell].states_per_unit
 
     def forward(self, features: th.Tensor, state: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -98,23 +134,8 @@ class RecurrentCore(Memory):
         x = x.reshape(self.n_members, steps, batch, -1)
         if state is None:
             state = features.new_zeros(self.n_members, batch, self.state_size)
-        results = [self._unroll(*member) for member in zip(self.cells, x.unbind(0), state.unbind(0), strict=True)]
+        unrolls: list[Any] = [cell.unroll for cell in self.cells]
+        members = zip(unrolls, x.unbind(0), state.unbind(0), strict=True)
+        results = [in_float32(functools.partial(unroll, state=before), inputs) for unroll, inputs, before in members]
         outputs, states = zip(*results, strict=True)
         return th.stack(outputs), th.stack(states)
-
-    @staticmethod
-    def _unroll(cell: Any, x: th.Tensor, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """
-        :param cell: GRU or LSTM of one member
-        :param x: output of the hidden layers, shape (T, B, F)
-        :param state: state before the first step, shape (B, S); an LSTM's hidden and cell state side by side
-        :return: outputs, shape (T, B, H), and state after the last step, shape (B, S)
-        """
-        if isinstance(cell, nn.GRU):
-            outputs, last = cell(x, state[None])
-            return outputs, last[0]
-        outputs, (hidden, inner) = cell(x, tuple(part[None].contiguous() for part in state.chunk(2, dim=-1)))
-        return outputs, th.cat([hidden[0], inner[0]], dim=-1)
-
-
-CELLS: dict[str, Any] = {"gru": nn.GRU, "lstm": nn.LSTM}

@@ -66,6 +66,7 @@ WITH_MEMORY = {
     **{name: partial(make, name, TwoViewBandit(length=5)) for name, line in LINES.items() if line.remembers},
     "recurrent": lambda: _recurrent("Gru", Recall()),
     "recurrent, continuous": lambda: _recurrent("Lstm", Recall(continuous=True)),
+    "recurrent, linear": lambda: _recurrent("Gru", Recall(continuous=True), rnn_type="lru"),
     "recurrent, normalised": lambda: _recurrent("Lstm", _normalised()),
     "recurrent, image": lambda: _recurrent("Gru", Sampled(IMAGE), **CNN | SHARED),
 }
@@ -119,7 +120,7 @@ def test_the_file_acts_as_predict_does(kind, suffix, tmp_path):
 def test_a_memory_is_carried_and_reset(kind, tmp_path):
     """500 sequences of 20 observations, twice."""
     model = WITH_MEMORY[kind]().learn(60)
-    unlike_each_other(model.policy, scale=0.2 if "image" in kind or kind in LINES else 1.0)
+    unlike_each_other(model.policy, scale=0.2 if "image" in kind or "linear" in kind or kind in LINES else 1.0)
     learner = OnnxPolicy.load(export_learner(model, tmp_path / "learner.onnx"))
     script = th.jit.load(str(export_learner(model, tmp_path / "learner.pt")))
     sequence = [_drawn(model, 500, seed=step) for step in range(20)]

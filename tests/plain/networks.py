@@ -10,6 +10,8 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_gac.networks.linear_recurrent_unit import LinearRecurrentUnit
+
 Observation = dict[str, th.Tensor]
 
 
@@ -19,7 +21,7 @@ class Network(nn.Module):
 
     :param keys: of the entries
     :param before: layers up to the recurrent one
-    :param cell: GRU or LSTM, ``None`` for a network that remembers nothing
+    :param cell: recurrent layer, ``None`` for a network that remembers nothing
     :param after: layers up to the heads
     :param heads: name -> last layer
     """
@@ -46,6 +48,32 @@ class Network(nn.Module):
         for layer in self.after:
             x = nn.functional.silu(layer(x))
         return x
+
+
+class LinearRecurrence(nn.Module):
+    """
+    The linear recurrent unit step by step, in complex numbers.
+
+    :param unit: the package's, whose parameters are copied
+    """
+
+    def __init__(self, unit: LinearRecurrentUnit):
+        super().__init__()
+        self.of_unit = nn.ParameterDict({name: value.detach().clone() for name, value in unit.named_parameters()})
+
+    def forward(self, x: th.Tensor, state: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
+        """Outputs and last state, which is complex, of sequences (T, B, F) and of the state before, (B, H)."""
+        of = self.of_unit
+        factor = th.exp(th.complex(-of["nu_log"].exp(), of["theta_log"].exp()))
+        weight = th.complex(*of["input_weight"].chunk(2))
+        output_weight = th.complex(*of["output_weight"].chunk(2, dim=1)).conj()  # pairs of numbers: Re(C h) = Re C Re h - ...
+        outputs = []
+        for row in x:
+            added = of["gamma_log"].exp() * (row.to(weight.dtype) @ weight.t())
+            state = added if state is None else factor * state + added
+            outputs.append((state @ output_weight.t()).real + row @ of["direct_weight"].t() + of["bias"])
+        assert state is not None
+        return th.stack(outputs), state
 
 
 def plain_policy(network: Any) -> Network:
@@ -81,9 +109,15 @@ def _memory(memory: Any, member: int) -> tuple[list[nn.Module], Any]:
         return [], None
     layers = [layer for layer in memory.hidden if hasattr(layer, "weight")]
     cell = memory.cells[member]
-    copy = type(cell)(cell.input_size, cell.hidden_size)
+    return [_linear(layer.weight[member].t(), layer.bias[member, 0]) for layer in layers], _cell(cell)
+
+
+def _cell(cell: Any) -> nn.Module:
+    if isinstance(cell, LinearRecurrentUnit):
+        return LinearRecurrence(cell)
+    copy = (nn.GRU if isinstance(cell, nn.GRU) else nn.LSTM)(cell.input_size, cell.hidden_size)
     copy.load_state_dict(cell.state_dict())
-    return [_linear(layer.weight[member].t(), layer.bias[member, 0]) for layer in layers], copy
+    return copy
 
 
 def _linear(weight: th.Tensor, bias: th.Tensor) -> nn.Linear:
