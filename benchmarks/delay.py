@@ -6,7 +6,7 @@ Which memory learns a long delay, and in how many gradient steps::
 The task is POPGym's RepeatPrevious without rewards: each step shows one of four symbols at random, and the label is the symbol
 of ``delay`` steps ago. So no exploration and no critic has a part in the result. The memory lies between layers of 64 units,
 as in the preset ``learner-memory``, and learns with Adam from batches of 16 new sequences. A trial ends when 95% of the
-answers are right in each of 20 batches in a row, or after ``--steps`` gradient steps. Trials in the file of ``--out`` are kept.
+answers are right in each of 20 batches in a row, or after ``--steps`` gradient steps. Trials in the file of ``--out`` stay.
 """
 
 import argparse
@@ -67,7 +67,7 @@ class Contender(NamedTuple):
 
     :param cell: kind of recurrent layer
     :param prepare: function that changes its initial parameters, of the memory and the delay
-    :param learning_rate: of all layers
+    :param learning_rate: learning rate
     :param memory_scale: multiple of the learning rate for the memory
     """
 
@@ -110,7 +110,6 @@ def run(trial: Trial) -> dict[str, Any]:
     :return: the trial's fields, ``needed``, the gradient steps to the goal (``None`` if not reached), ``accuracy`` of the last
         batches, and processor ``seconds``
     """
-    th.set_num_threads(1)
     th.manual_seed(trial.seed)
     contender = CONTENDERS[trial.contender]
     core = RecurrentCore(contender.cell, SYMBOLS, [UNITS], UNITS)
@@ -145,7 +144,7 @@ def _reached(right: list[float]) -> bool:
 
 def _run_all(trials: list[Trial], jobs: int) -> Iterator[dict[str, Any]]:
     if trials:
-        with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+        with multiprocessing.get_context("spawn").Pool(jobs, th.set_num_threads, (1,)) as pool:
             yield from pool.imap_unordered(run, trials)
 
 
