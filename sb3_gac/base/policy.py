@@ -62,10 +62,9 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
     :param normalize_images: whether to divide images by 255
     :param optimizer_class: class of the optimisers of all networks
     :param optimizer_kwargs: keyword arguments of that class, without the learning rate
-    :param rnn_type: type of the networks' memories, "gru", "lstm" or "lru" (:class:`LinearRecurrentUnit
-        <sb3_gac.networks.linear_recurrent_unit.LinearRecurrentUnit>`), with which they take sequences; or role -> type, where
-        "critic" stands for all critics and "partial" for every network that reads ``partial`` alone; ``None`` for the
-        default of the policy class
+    :param rnn_type: type of the networks' memories, "gru", "lstm" or "lru" (a linear recurrent unit, for long delays), with
+        which they take sequences; or role -> type, where "critic" stands for all critics and "partial" for every network
+        that reads ``partial`` alone; ``None`` for the default of the policy class
     :param rnn_hidden_size: size of the recurrent layer, which comes after the layers of ``net_arch``
     :param rnn_net_arch: hidden layer sizes after the recurrent layer
     :param softplus_min_std: smallest standard deviation, to which softplus of the network's output is added (Brax has 0.001);

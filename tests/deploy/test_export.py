@@ -49,7 +49,7 @@ def _normalised():
 
 
 def _recurrent(cell, env, **policy_kwargs):
-    options = {"learning_starts": 40, "batch_size": 4, "device": "cpu"}
+    options = {"learning_starts": 40, "batch_size": 4, "seed": 0, "device": "cpu"}
     return GAC(f"MultiInput{cell}Policy", env, policy_kwargs=RECURRENT | policy_kwargs, **options)
 
 
