@@ -181,12 +181,11 @@ def main() -> None:
     parser.add_argument("--out", required=True, help="path of the results, without a suffix")
     args = parser.parse_args()
     path = Path(args.out).with_suffix(".json")
-    known = json.loads(path.read_text())["trials"] if path.exists() else []
+    saved = json.loads(path.read_text())["trials"] if path.exists() else []
+    known = {Trial(*(row[key] for key in Trial._fields)): row for row in saved}
     wanted = [Trial(*key) for key in itertools.product(CONTENDERS, args.delays, range(args.seeds), [args.steps])]
-    rows = [row for row in known if Trial(*(row[key] for key in Trial._fields)) in wanted]
-    made = {Trial(*(row[key] for key in Trial._fields)) for row in rows}
-    left = [trial for trial in wanted if trial not in made]
-    for row in _run_all(left, args.jobs):
+    rows = [known[trial] for trial in wanted if trial in known]
+    for row in _run_all([trial for trial in wanted if trial not in known], args.jobs):
         rows.append(row)
         print(row, flush=True)
         command = shlex.join(["python", "-m", "benchmarks.delay", *sys.argv[1:]])

@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 import sb3_gac
@@ -87,18 +86,10 @@ def test_depth_is_that_of_the_longest_way():
     assert [_depth(cls) for cls in (A, B, Both)] == [0, 1, 2]
 
 
-@pytest.fixture
-def one_thread():
-    """With more, branches of an update run on threads of their own, whose calls do not begin at ``train``."""
-    before = th.get_num_threads()
-    th.set_num_threads(1)
-    yield
-    th.set_num_threads(before)
-
-
 @pytest.mark.parametrize(("name", "loss"), [("gac", "guider_loss"), ("gac", "learner_loss"), ("asymmetric_sac", "actor_loss")])
-def test_four_calls_from_train_to_the_equation(name, loss, monkeypatch, one_thread):
+def test_four_calls_from_train_to_the_equation(name, loss, monkeypatch, set_threads):
     """``ent_coef * log_prob - q`` stands in ``policy_loss``: how many of our functions are on the way to it."""
+    set_threads(1)  # with more, branches of an update run on threads of their own, whose calls do not begin at train
     algorithm = algorithm_class(name)
     module, ways = sys.modules[algorithm.__module__], {}
     policy_loss = module.policy_loss

@@ -11,11 +11,8 @@ from tests.helpers import small_model
 
 
 @pytest.fixture
-def two_threads():
-    before = th.get_num_threads()
-    th.set_num_threads(2)
-    yield
-    th.set_num_threads(before)
+def two_threads(set_threads):
+    set_threads(2)
 
 
 def _trained(threads, **arguments):
