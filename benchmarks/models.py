@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import Logger
 import sb3_gac
 from benchmarks.contenders import alternate, timer
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.networks.recurrent import GRU
 
 SIZES = {"HalfCheetah": (8, 17, 6), "Ant": (13, 27, 8), "Humanoid": (169, 270, 17)}
 COMPILED, MIXED = {"compile": True}, {"compile": True, "mixed_precision": True}
@@ -173,7 +174,7 @@ def matmul_rate(batch: int, width: int) -> float:
     return 2.0 * batch * width * width / float(np.median(seconds))
 
 
-class LoopedGRU(th.nn.GRU):
+class LoopedGRU(GRU):
     """A GRU without a fused pass over time: it is called once for each step."""
 
     def forward(self, x: th.Tensor, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:  # type: ignore[override]
@@ -216,7 +217,7 @@ def make_recurrent_step(what: str, sizes: tuple[int, int, int], length: int, bat
         return lambda: buffer.sample(batch)
     if what == "looped":
         for module in model.policy.modules():
-            if isinstance(module, th.nn.GRU):
+            if isinstance(module, GRU):
                 module.__class__ = LoopedGRU
     return lambda: model.train(1, batch)
 
