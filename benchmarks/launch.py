@@ -5,7 +5,8 @@ Makes the runs of a suite, several side by side with one thread each::
 
 Finished runs are skipped and unfinished ones go on from their checkpoints, so the same command resumes an interrupted launch.
 Runs whose directories are elsewhere, or gone, count as finished if the results named by ``--reuse-results`` contain them.
-The whole suite is checked before the first run.  A failed run is tried again; if it fails for good, the reason is printed.
+The whole suite is checked before the first run.  Runs start in the suite's order: what matters most stands first in the file.
+A failed run is tried again; if it fails for good, the reason is printed.
 Where a run needs another run's model, the other run is made first, once for all that need it; if it fails, the runs that
 need it are not started.  ``--dry-run`` prints the commands of the runs that are left, and counts them.  ``--engine ray``
 makes the runs on a Ray cluster whose nodes share this checkout, its Python and the directory of the runs.
@@ -43,7 +44,8 @@ def jobs_left(suite: Path, runs: Path, reuse: Sequence[Path] = (), rerun: Sequen
     :param runs: directory of all runs
     :param reuse: paths of results, without a suffix, whose runs count as finished too
     :param rerun: names of the algorithms whose runs in ``reuse`` do not count
-    :return: jobs of the runs that are not finished, first those that others need; and the number of the suite's finished runs
+    :return: jobs of the runs that are not finished, in the suite's order, each after those that it needs; and the
+        number of the suite's finished runs
     :raises ValueError: naming the place and the fault in the suite
     """
     specs = read_suite(suite)
@@ -53,8 +55,7 @@ def jobs_left(suite: Path, runs: Path, reuse: Sequence[Path] = (), rerun: Sequen
     jobs: dict[str, Job] = {}
     for index, spec in left:
         _add_job(jobs, spec, partial(run_command, suite, index, runs), runs)
-    needed = {name_of(other.spec) for job in jobs.values() for other in job.needs}
-    return sorted(jobs.values(), key=lambda job: name_of(job.spec) not in needed), len(specs) - len(left)
+    return list(jobs.values()), len(specs) - len(left)
 
 
 def _add_job(
@@ -157,7 +158,7 @@ def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine, finished
     with ThreadPoolExecutor(at_once) as pool:
         try:
             with shown:
-                for future in in_order(jobs, lambda job: pool.submit(launch_one, job, retries, engine, tell), tell):
+                for future in in_order(jobs, at_once, lambda job: pool.submit(launch_one, job, retries, engine, tell), tell):
                     future.result()
         except KeyboardInterrupt:
             print("Stopped. The same command goes on from the runs' checkpoints.", flush=True)
@@ -165,27 +166,29 @@ def launch(jobs: list[Job], at_once: int, retries: int, engine: Engine, finished
 
 
 def in_order(
-    jobs: Sequence[Job], submit: Callable[[Job], "Future[None]"], tell: Callable[[Job], None]
+    jobs: Sequence[Job], at_once: int, submit: Callable[[Job], "Future[None]"], tell: Callable[[Job], None]
 ) -> Iterator["Future[None]"]:
     """
-    Submit each job as soon as all jobs that it needs have ended. If one of these failed, the job is not submitted.
+    Submit jobs in their order as others end, so that each waits no longer than for the jobs that it needs. If one of these
+    failed, the job is not submitted.
 
     :param jobs: jobs of the runs to make
-    :param submit: function that puts a job into the queue of those to start, and returns its future
+    :param at_once: number of jobs side by side
+    :param submit: function that starts a job, and returns its future
     :param tell: function that is called with a job when its state has changed to "not started"
     :return: futures of the jobs that were submitted, as they end
     """
     left = list(jobs)
     running: set[Future[None]] = set()
     while left or running:
-        ready = [job for job in left if job.is_ready]
-        left = [job for job in left if not job.is_ready]
-        for job in ready:
+        for job in left:
             if job.lacking:
                 job.state = "not started"
                 tell(job)
-            else:
-                running.add(submit(job))
+        left = [job for job in left if job.state == "waiting"]
+        for job in [job for job in left if job.is_ready][: at_once - len(running)]:
+            left.remove(job)
+            running.add(submit(job))
         if running:
             # If another thread gets Ctrl-C's signal, this thread sees it when it next runs: within a second
             ended, running = wait(running, timeout=1, return_when=FIRST_COMPLETED)

@@ -3,12 +3,15 @@
 import json
 import sys
 import threading
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 import benchmarks.aggregate
 import benchmarks.launch
@@ -17,7 +20,7 @@ import benchmarks.run
 from benchmarks.aggregate import finished_runs
 from benchmarks.finished import name_of
 from benchmarks.jobs import Job, count
-from benchmarks.launch import jobs_left, launch, run_command
+from benchmarks.launch import in_order, jobs_left, launch, run_command
 from benchmarks.run import run
 from benchmarks.suite import RunSpec, needed_runs, needed_steps, read_suite
 from sb3_gac import AsymmetricSAC
@@ -105,20 +108,59 @@ def test_without_steps_a_needed_run_has_as_many_as_the_one_that_needs_it_and_a_c
         assert (needed.algorithm, needed.steps) == expected
 
 
-def test_needed_runs_come_first_and_once(tmp_path):
+def test_jobs_are_in_the_suites_order_after_those_that_they_need_each_once(tmp_path):
     cell = CELL | {"algorithms": ["sac-asym", "taught", "twice"], "seeds": [0, 1]}
     jobs, finished = jobs_left(_suite(tmp_path, cell, {**CELL, "algorithms": ["gac"]}), tmp_path)
     assert finished == 0
-    assert _names(jobs) == [
-        "small-40/sac-full/seed0",
-        "small-30/taught/seed0",
-        "small-40/sac-full/seed1",
-        "small-30/taught/seed1",
-        *(f"small-60/{algorithm}/seed{seed}" for seed in (0, 1) for algorithm in ("sac-asym", "taught", "twice")),
-        "small-60/gac/seed0",
-    ]
-    assert [_names(job.needs) for job in jobs[1:2]] == [["small-40/sac-full/seed0"]]
-    assert jobs[5].needs == [jobs[0]], "the same job"
+    of_a_seed = ["small-60/sac-asym", "small-40/sac-full", "small-60/taught", "small-30/taught", "small-60/twice"]
+    assert _names(jobs) == [f"{name}/seed{seed}" for seed in (0, 1) for name in of_a_seed] + ["small-60/gac/seed0"]
+    assert _names(jobs[3].needs) == ["small-40/sac-full/seed0"]
+    assert jobs[2].needs == jobs[3].needs == [jobs[1]], "the same job"
+    assert jobs[2].needs[0] is jobs[3].needs[0]
+
+
+@given(st.data())
+def test_one_at_a_time_jobs_start_in_their_order_but_for_those_whose_needs_failed(data):
+    jobs = [_job(0)]
+    for seed in range(1, data.draw(st.integers(1, 8))):
+        jobs.append(_job(seed, [jobs[i] for i in data.draw(st.sets(st.integers(0, seed - 1), max_size=2))]))
+    fail = data.draw(st.sets(st.integers(0, 7)))
+    started, told = _started(jobs, 1, fail)
+    hopeless: set[int] = set()
+    for job in jobs:
+        if any(other.spec.seed in fail | hopeless for other in job.needs):
+            hopeless.add(job.spec.seed)
+    assert started == [[job.spec.seed] for job in jobs if job.spec.seed not in hopeless]
+    assert sorted(told) == sorted(hopeless), "each once"
+
+
+def test_a_job_that_waits_leaves_its_place_to_the_next_and_there_is_room_for_no_more():
+    first = _job(0)
+    jobs = [first, _job(1, [first]), _job(2), _job(3), _job(4)]
+    assert _started(jobs, 2) == ([[0, 2], [1, 3], [4]], [])
+
+
+def _job(seed, needs=()):
+    return Job(RunSpec("x", "Pendulum", 0.1, seed, 60, 2, "small", 20, 1), Path(), [], needs=list(needs))
+
+
+def _started(jobs, at_once, fail=()):
+    """The seeds of the jobs that start together, in order, when all of them end together; and of those that do not start."""
+    told, rounds, together = [], [], []
+
+    def submit(job):
+        together.append(job)
+        future = Future()
+        if len(together) == min(at_once, sum(other.state == "waiting" and other.is_ready for other in jobs)):
+            rounds.append([other.spec.seed for other in together])
+            for other in together:
+                other.state = "failed" if other.spec.seed in fail else "finished"
+            together.clear()
+        future.set_result(None)
+        return future
+
+    assert len(list(in_order(jobs, at_once, submit, lambda job: told.append(job.spec.seed)))) == sum(map(len, rounds))
+    return rounds, told
 
 
 def test_a_needed_run_that_the_suite_has_is_that_one(tmp_path):
@@ -141,7 +183,7 @@ def launched(tmp_path_factory):
 def test_launch_runs_what_is_needed_and_hands_on_its_model(launched):
     path, runs, commands = launched
     suite = run_command(path, 0, runs)
-    assert commands == [[*suite, "--needed", "teacher"], run_command(path, 1, runs), suite], "what waits leaves its place"
+    assert commands == [[*suite, "--needed", "teacher"], suite, run_command(path, 1, runs)]
     directory = runs / "small-60/Pendulum-noise0.1/taught/seed0"
     model = Taught.load(directory / "model")
     assert model.teacher == str(runs / "small-40/Pendulum-noise0.1/sac-full/seed0/model.zip")
@@ -240,7 +282,7 @@ def three(tmp_path):
     return jobs
 
 
-def test_jobs_that_wait_leave_their_place_to_others(three):
+def test_one_at_a_time_a_launch_keeps_the_order(three):
     started = []
 
     class Engine:
@@ -249,7 +291,7 @@ def test_jobs_that_wait_leave_their_place_to_others(three):
             return 0
 
     launch(three, 1, 0, Engine())
-    assert started == ["teacher", "other", "student"]
+    assert started == ["teacher", "student", "other"]
     three[1].state = "not started"
     assert count(three) == "1 not started, 2 finished, 0 running, 0 waiting"
 
