@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch as th
 import yaml
+from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from benchmarks import aggregate, launch
@@ -26,11 +27,11 @@ from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 from sb3_gac.optim.compile import PAYS_FROM, missing_compiler
 from sb3_gac.presets import PRESETS, read_preset
-from sb3_gac.training.evaluation import UniformActions
+from sb3_gac.training.evaluation import MiddleAction, UniformActions
 from sb3_gac.training.options import from_yaml, mapping, positive
 
 ALGORITHMS = (FULL, ASYMMETRIC, GUIDED, PARTIAL)
-EVALUATIONS, RANDOM_EPISODES = 20, 30
+EVALUATIONS, UNTRAINED_EPISODES = 20, 30
 _OF_TASKS = {"noise_std", "history"}
 
 
@@ -142,7 +143,7 @@ def command(options: argparse.Namespace) -> str:
     given = {
         "--env": [options.env],
         "--env-kwargs": [_flow(options.env_kwargs)] if options.env_kwargs else [],
-        "--wrappers": [wrapper if isinstance(wrapper, str) else _flow(wrapper) for wrapper in options.wrappers],
+        "--wrappers": [_wrapper(wrapper) for wrapper in options.wrappers],
         "--algorithms": options.algorithms if tuple(options.algorithms) != ALGORITHMS else [],
         "--seeds": [options.seeds],
         "--steps": [options.steps],
@@ -152,6 +153,14 @@ def command(options: argparse.Namespace) -> str:
     }
     words = [str(word) for name, values in given.items() if values for word in (name, *values)]
     return shlex.join(["python", "-m", "sb3_gac.compare", *words, *(["--whole-state"] * options.whole_state)])
+
+
+def _wrapper(wrapper: Any) -> str:
+    """The text of a wrapper as a person would type it: without braces and quotes around a name and its arguments."""
+    if isinstance(wrapper, Mapping) and len(wrapper) == 1:
+        ((name, arguments),) = wrapper.items()
+        return f"{name}: {_flow(arguments)}"
+    return wrapper if isinstance(wrapper, str) else _flow(wrapper)
 
 
 def _flow(values: Any) -> str:
@@ -211,32 +220,41 @@ def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
     results = options.out / "results"
     aggregate.main([str(suite), "--runs", str(runs), "--out", str(results)])
     tidy = read_tidy(file_of(results, "csv"))
-    found = worth(tidy, random_returns(read_suite(suite)[0], options.out / "random.json"))
+    found = worth(tidy, untrained_returns(read_suite(suite)[0], options.out / "untrained.json"))
     path: Path = options.out / "index.html"
     path.write_text(page(tidy, found, command(options), file_of(results, "json"), options.steps))
     print("\n" + "\n".join([*recommendation(found, options.steps), "", *findings(found)]))
     return path
 
 
-def random_returns(spec: RunSpec, path: Path) -> np.ndarray:
+def untrained_returns(spec: RunSpec, path: Path) -> dict[str, np.ndarray]:
     """
     :param spec: settings of a run
     :param path: JSON file from which the returns are read; if there is none, or one of another environment, the episodes are
         run and the file is written
-    :return: returns of episodes with random actions, on the environments of evaluations, shape (N,)
+    :return: name of a policy without training -> returns of its episodes, on the environments of evaluations, shape (N,)
     """
     wrappers = spec.environment["wrappers"] if spec.environment else []
-    what = {"environment": environment(spec), "wrappers": wrappers, "episodes": [RANDOM_EPISODES, spec.eval_episodes]}
+    what = {"environment": environment(spec), "wrappers": wrappers, "episodes": [UNTRAINED_EPISODES, spec.eval_episodes]}
     recorded = json.loads(json.dumps(what, default=str))
     known = json.loads(path.read_text()) if path.exists() else {}
-    if not isinstance(known, dict) or known.get("of") != recorded:  # a list is of an earlier version, and of who knows what
-        env = make_envs(spec, spec.eval_episodes)
-        env.seed(EVAL_SEED)
-        returns, _ = evaluate_policy(UniformActions(env), env, RANDOM_EPISODES, return_episode_rewards=True)
-        env.close()
-        known = {"of": recorded, "returns": returns}
+    if known.get("of") != recorded:
+        known = {"of": recorded, "returns": _untrained_returns(spec)}
         path.write_text(json.dumps(known))
-    return np.array(known["returns"])
+    return {name: np.array(returns) for name, returns in known["returns"].items()}
+
+
+def _untrained_returns(spec: RunSpec) -> dict[str, list[float]]:
+    env = make_envs(spec, spec.eval_episodes)
+    policies: dict[str, Any] = {"random actions": UniformActions(env)}
+    if isinstance(env.action_space, spaces.Box) and env.action_space.is_bounded():
+        policies["the middle action"] = MiddleAction(env)
+    returns: dict[str, Any] = {}
+    for name, policy in policies.items():
+        env.seed(EVAL_SEED)
+        returns[name], _ = evaluate_policy(policy, env, UNTRAINED_EPISODES, return_episode_rewards=True)
+    env.close()
+    return returns
 
 
 def main(description: str | None = None) -> None:

@@ -5,6 +5,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from plotly import graph_objects
 
@@ -32,9 +33,12 @@ _FRAME = {
     "hoverlabel": {"namelength": -1},
     "legend": {"orientation": "h", "y": -0.22},
 }
+#: First part of training whose returns the axis need not hold
+HIDDEN = 0.25
 _RETURNS = (
     "Mean return of what is deployed, over all seeds. Bands hold the mean with 95% confidence by Student's t; thin lines are "
-    "the seeds, dashes the guider. A click on a name switches it off."
+    "the seeds, dashes the guider. A click on a name switches it off. The axis fits the last three quarters of training; a "
+    "double click shows all."
 )
 _HEADROOM = (
     "Headroom over training: SAC on the full state over SAC-asym at the same step, with its interval. Above 0, seeing more "
@@ -54,7 +58,7 @@ def page(tidy: pd.DataFrame, found: Worth, command: str, results: Path, steps: i
     task = title_of(str(tidy.task.iloc[0]), float(tidy.noise.iloc[0]))
     verdict = "".join(f"<p>{html.escape(text)}</p>" for text in recommendation(found, steps))
     told = "".join(f"<li>{html.escape(text)}</li>" for text in findings(found))
-    plots = [_plot("Returns", _curves(tidy, found.random[0]), _RETURNS)]
+    plots = [_plot("Returns", _curves(tidy, found.floor, found.untrained[found.floor][0]), _RETURNS)]
     if found.headroom is not None:
         plots.append(_plot("Headroom", _headroom(tidy), _HEADROOM))
     heading = f"{task}: what privileged information is worth"
@@ -70,7 +74,7 @@ def _plot(name: str, figure: graph_objects.Figure, caption: str) -> Plot:
     return Plot(name, figure, figure, caption)
 
 
-def _curves(tidy: pd.DataFrame, random_return: float) -> graph_objects.Figure:
+def _curves(tidy: pd.DataFrame, floor: str, floor_return: float) -> graph_objects.Figure:
     figure = graph_objects.Figure()
     tidy = tidy.assign(algorithm=tidy.algorithm.map(title))
     for algorithm, color in palette(list(tidy.algorithm.unique())).items():
@@ -78,9 +82,19 @@ def _curves(tidy: pd.DataFrame, random_return: float) -> graph_objects.Figure:
         for line in lines:
             line.showlegend = line.name == algorithm
         figure.add_traces(lines)
-    note = {"annotation_text": "random actions", "annotation_position": "bottom right"}
-    figure.add_hline(y=random_return, line={"color": "#888", "width": 1, "dash": "dot"}, **note)
-    return figure.update_layout(xaxis_title=STEPS, yaxis_title=RETURN, **_FRAME)
+    note = {"annotation_text": f"{floor}, without training", "annotation_position": "bottom right"}
+    figure.add_hline(y=floor_return, line={"color": "#888", "width": 1, "dash": "dot"}, **note)
+    shown = _shown(tidy, floor_return)
+    return figure.update_layout(xaxis_title=STEPS, yaxis_title=RETURN, yaxis_range=shown, **_FRAME)
+
+
+def _shown(tidy: pd.DataFrame, floor_return: float) -> tuple[float, float]:
+    """The ends of the axis of returns: without the first quarter of training, whose falls would flatten all that follows."""
+    late = tidy[tidy.timesteps >= HIDDEN * tidy.timesteps.max()]
+    values = np.append(late[[name for name in ("learner", "guider") if name in late]].to_numpy(float), floor_return)
+    low, high = np.nanmin(values), np.nanmax(values)
+    margin = 0.08 * (high - low) or 1.0
+    return low - margin, high + margin
 
 
 def _headroom(tidy: pd.DataFrame) -> graph_objects.Figure:
@@ -104,9 +118,9 @@ def _ends_table(found: Worth) -> str:
         seeds, curve = ", ".join(map(number, ends)), float(found.areas[name].mean())
         fields = [Field(title(name)), _return(mean), Field(interval), Field(seeds), _return(curve)]
         rows.append((fields, name == best))
-    mean, low, high = found.random
-    interval = f"{number(low)} to {number(high)}"
-    rows.append(([Field("random actions"), _return(mean), Field(interval), Field(""), Field("")], False))
+    for name, (mean, low, high) in found.untrained.items():
+        interval = f"{number(low)} to {number(high)}"
+        rows.append(([Field(f"{name}, without training"), _return(mean), Field(interval), Field(""), Field("")], False))
     head = ["algorithm", "mean at the end", f"{CONFIDENCE:.0%} interval", "each seed at the end", "mean of the whole curve"]
     return table(head, rows)
 
@@ -137,7 +151,8 @@ def _how(found: Worth, command: str, results: Path, steps: int) -> str:
         f"<h2>How it was made</h2><p>{counted(seeds, 'seed')} of each algorithm, {steps:,} environment steps "
         "each. A run's end is the mean of the last quarter of its evaluations, on environments that training never sees. "
         "Intervals of differences are Welch's t intervals over seeds. “What was learned” is the distance from the return of "
-        "random actions to the best mean end; less than a twentieth of it counts as no difference.</p>"
+        f"the best policy without training, {found.floor}, to the best mean end; less than a twentieth of it counts as no "
+        "difference.</p>"
         f"<pre>{html.escape(command)}</pre>"
         f"<details><summary>Settings and versions</summary><pre>{html.escape(json.dumps(origin, indent=1))}</pre></details>"
     )

@@ -6,6 +6,7 @@ first for ``all`` algorithms, then for the families and classes from which the a
 and the algorithm's own arguments.
 """
 
+import traceback
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -105,7 +106,7 @@ def _check_values(where: str, specs: Iterable[RunSpec]) -> None:
             finally:
                 env.close()
         except Exception as error:
-            said = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            said = error if isinstance(error, ValueError) else _told(error)
             raise ValueError(f"{where}: {spec.cell}, {spec.algorithm}: {said}") from error
 
 
@@ -192,7 +193,13 @@ def try_out(where: str, spec: RunSpec) -> None:
         finally:
             env.close()
     except Exception as error:
-        raise ValueError(f"{where}, {spec.cell}, {spec.algorithm}: {type(error).__name__}: {error}") from error
+        raise ValueError(f"{where}, {spec.cell}, {spec.algorithm}: {_told(error)}") from error
+
+
+def _told(error: Exception) -> str:
+    """The type of an error, and its message; without a message, the line that raised it and its place."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {str(error).strip() or f'{last.line} ({last.filename}, line {last.lineno})'}"
 
 
 def resolve(spec: RunSpec) -> tuple[type, dict[str, Any]]:

@@ -42,8 +42,8 @@ class Worth(NamedTuple):
 
     :param ends: algorithm -> each seed's end, the mean return over the last quarter of the evaluations, shape (N,)
     :param areas: algorithm -> each seed's mean return over all evaluations, shape (N,)
-    :param random: mean return of random actions, and the two ends of its interval
-    :param span: learned return: the best algorithm's mean end, less the mean return of random actions
+    :param untrained: name of a policy without training -> its mean return, and the two ends of its interval
+    :param span: learned return: the best algorithm's mean end, less the mean return of the best policy without training
     :param headroom: difference of SAC on the full state over SAC-asym, ``None`` if one of the two has no runs
     :param in_training: difference of SAC-asym over SAC on partial alone, ``None`` if one of the two has no runs
     :param guider: difference of GAC over SAC-asym, ``None`` if one of the two has no runs
@@ -51,16 +51,21 @@ class Worth(NamedTuple):
 
     ends: dict[str, np.ndarray]
     areas: dict[str, np.ndarray]
-    random: tuple[float, float, float]
+    untrained: dict[str, tuple[float, float, float]]
     span: float
     headroom: Difference | None
     in_training: Difference | None
     guider: Difference | None
 
     @property
+    def floor(self) -> str:
+        """The best policy without training, which a trained one must leave behind."""
+        return max(self.untrained, key=lambda name: self.untrained[name][0])
+
+    @property
     def learned(self) -> list[str]:
-        """The algorithms whose median end is above the interval of random actions."""
-        return [name for name, end in self.ends.items() if np.median(end) > self.random[2]]
+        """The algorithms whose median end is above the interval of the best policy without training."""
+        return [name for name, end in self.ends.items() if np.median(end) > self.untrained[self.floor][2]]
 
     @property
     def deployable(self) -> list[str]:
@@ -69,18 +74,19 @@ class Worth(NamedTuple):
         return [name for name in SIMPLER_FIRST if name in self.ends] + others
 
 
-def worth(tidy: pd.DataFrame, random_returns: np.ndarray) -> Worth:
+def worth(tidy: pd.DataFrame, untrained: Mapping[str, np.ndarray]) -> Worth:
     """
     :param tidy: evaluations of one task, with the columns algorithm, seed, timesteps and learner
-    :param random_returns: returns of episodes with random actions, shape (N,)
+    :param untrained: name of a policy without training, such as "random actions" -> returns of its episodes, shape (N,)
     :return: worth of privileged information on the task
     """
     ends = by_algorithm(tidy, end_of)
     pairs = ((FULL, ASYMMETRIC), (ASYMMETRIC, PARTIAL), (GUIDED, ASYMMETRIC))
     differences = [difference(ends, *pair) if set(pair) <= set(ends) else None for pair in pairs]
     best = max(float(end.mean()) for end in ends.values())
-    random = mean_interval(random_returns)
-    return Worth(ends, by_algorithm(tidy, np.mean), random, best - random[0], *differences)
+    means = {name: mean_interval(returns) for name, returns in untrained.items()}
+    span = best - max(mean for mean, _, _ in means.values())
+    return Worth(ends, by_algorithm(tidy, np.mean), means, span, *differences)
 
 
 def end_of(returns: np.ndarray) -> float:
@@ -143,21 +149,22 @@ def findings(found: Worth) -> list[str]:
 _HEADROOM = {
     "more": "There is headroom. A policy that saw the privileged entries on the robot too returns {value} more than SAC-asym "
     "does without them: so much is there for a guider, a memory or more sensors to gain.",
-    "same": "There is no headroom: SAC-asym comes as far without the privileged entries as SAC does with them. No guider and "
-    "no memory can add much to that on this task.",
+    "same": "There is hardly any headroom, {value}: SAC-asym comes nearly as far without the privileged entries as SAC does "
+    "with them. No guider and no memory can add much to that on this task.",
     "less": "SAC on the full state ends below SAC-asym, by {value}: with these steps it is not the upper bound that it should "
     "be. It has more inputs to learn from; give it more --steps before you trust the headroom.",
     "unknown": "The headroom, the full state over SAC-asym, can't be told: {value}.",
 }
 _IN_TRAINING = {
     "more": "Privileged information in training alone is worth {value}: so much do critics that see it add to SAC on partial.",
-    "same": "Critics that see the privileged entries add nothing here: SAC on partial alone comes as far as SAC-asym.",
+    "same": "Critics that see the privileged entries add next to nothing here, {value}: SAC on partial alone comes about as "
+    "far as SAC-asym.",
     "less": "Critics that see the privileged entries do harm ({value}): what they know, the policy can't make use of.",
     "unknown": "Whether critics that see the privileged entries help can't be told: SAC-asym over SAC on partial is {value}.",
 }
 _GUIDER = {
     "more": "A guider is worth {value} on top of such critics: GAC over SAC-asym.",
-    "same": "A guider changes nothing on top of such critics: GAC and SAC-asym come equally far.",
+    "same": "A guider changes next to nothing on top of such critics, {value}: GAC and SAC-asym come about equally far.",
     "less": "A guider costs return here: GAC over SAC-asym is {value}.",
     "unknown": "Whether a guider adds to such critics can't be told: GAC over SAC-asym is {value}.",
 }
@@ -195,8 +202,9 @@ def recommendation(found: Worth, steps: int) -> list[str]:
     :return: sentences that name the algorithm to train with, how sure the choice is, and the next steps
     """
     if not found.learned:
+        floor = number(found.untrained[found.floor][0])
         return [
-            f"No algorithm ends above random actions, which return {number(found.random[0])}: nothing was learned in "
+            f"No algorithm ends above the return of {found.floor} without training, {floor}: nothing was learned in "
             f"{steps:,} steps, and these runs say nothing about privileged information.",
             "Give more --steps, or another --preset.",
         ]
@@ -218,7 +226,7 @@ def _choice(found: Worth) -> Sequence[str]:
         others = listed([title(name) for name in tied[1:]])
         sure = all(difference(found.ends, name, chosen).verdict(NEGLIGIBLE * found.span) == "same" for name in tied[1:])
         comes = "comes" if len(tied) == 2 else "come"
-        why = f"{comes} equally far" if sure else "can't be told from it with these seeds"
+        why = f"{comes} about equally far" if sure else "can't be told from it with these seeds"
         return [text, f"It is the simplest of those that do best: {others} {why}."]
     return [text]
 

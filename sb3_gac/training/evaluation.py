@@ -1,8 +1,9 @@
-"""Evaluation of a finished run: the learner as it is deployed, beside random actions."""
+"""Evaluation of a finished run: the learner as it is deployed, beside policies without training."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -39,6 +40,23 @@ class UniformActions:
     def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> Any:
         """Random actions, with the arguments and result of a model's ``predict``."""
         return np.stack([self._space.sample() for _ in range(self._n_envs)]), state
+
+
+class MiddleAction:
+    """
+    A policy that always takes the middle action of a Box, which lets a robot stand still, or hang. An untrained policy's
+    likeliest action is near it.
+
+    :param env: vectorised environments with finite bounds of actions
+    """
+
+    def __init__(self, env: VecEnv):
+        space = cast(spaces.Box, env.action_space)
+        self._actions = np.stack([((space.low + space.high) / 2).astype(space.dtype)] * env.num_envs)
+
+    def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> Any:
+        """The middle action, with the arguments and result of a model's ``predict``."""
+        return self._actions.copy(), state
 
 
 def evaluate(policy: Any, env: VecEnv, episodes: int) -> tuple[float, float]:

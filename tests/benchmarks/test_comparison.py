@@ -6,8 +6,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 import yaml
+from gymnasium import spaces
 
 from benchmarks import comparison, launch
 from benchmarks.comparison import command, main, parse_arguments, suite_of_options
@@ -39,6 +42,35 @@ def make_env(torque=2.0):
     env.unwrapped.max_torque = torque
     return env
 """
+
+
+class MiddleWins(gymnasium.Env):
+    """Five steps, each of which rewards the middle action, 1.5, with 1."""
+
+    observation_space = spaces.Box(-1, 1, (1,))
+    action_space = spaces.Box(1, 2, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.step_number = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.step_number += 1
+        return np.zeros(1, np.float32), float(np.all(action == 1.5)), self.step_number == 5, False, {}
+
+
+class Broken(MiddleWins):
+    """An environment with an error that says nothing."""
+
+    def __init__(self):
+        raise NotImplementedError
+
+
+class Numbers(MiddleWins):
+    """The same with two actions, neither of which is in the middle."""
+
+    action_space = spaces.Discrete(2)
 
 
 class InProcess:
@@ -115,6 +147,7 @@ def test_the_command_on_the_page_is_the_same_comparison():
     options = parse_arguments(None, given)
     again = parse_arguments(None, shlex.split(command(options))[3:])
     assert vars(again) == vars(options)
+    assert SPLIT in shlex.split(command(options)), "as it was typed"
 
 
 def test_critics_see_every_entry_unless_privileged_is_the_whole_state():
@@ -159,6 +192,7 @@ def test_a_function_that_makes_an_environment(engine, monkeypatch, tmp_path):
         (["--env", "Pendulum-v1"], "partial"),
         (["--env", "NoSuchEnvironment-v7"], "NoSuchEnvironment"),
         (["--env", "no_such_module:make"], "no_such_module"),
+        (["--env", f"{__name__}:Broken"], "NotImplementedError: raise NotImplementedError (" + __file__),
         ([*SHORT, "--overrides", "{gama: 0.9}"], "gama"),
         ([*SHORT, "--overrides", "{1: 2, foo: 3}"], "has no arguments ['1', 'foo']"),
         (["--env", "Pendulum-v1", "--wrappers", "5"], "wrappers: must be module:Class"),
@@ -188,10 +222,10 @@ def test_bad_options_are_named(capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
-def test_returns_of_random_actions_are_read_again_only_where_they_are_of_the_same_environment(tmp_path, monkeypatch):
+def test_returns_without_training_are_read_again_only_where_they_are_of_the_same_environment(tmp_path, monkeypatch):
     played = []
     monkeypatch.setattr(comparison, "evaluate_policy", lambda *_, **__: (played.append(1) or [float(len(played))], []))
-    path = tmp_path / "random.json"
+    path = tmp_path / "untrained.json"
     spec = RunSpec("sac", "Pendulum", 0.1, 0, 60, 1, "small", 20, 1)
     own = {"id": "Pendulum-v1", "kwargs": {"g": 9.0}, "wrappers": []}
     specs = [
@@ -200,13 +234,25 @@ def test_returns_of_random_actions_are_read_again_only_where_they_are_of_the_sam
         replace(spec, history=3),
         replace(spec, environment=own),
         replace(spec, environment=own | {"kwargs": {"g": 1.0}}),
-        replace(spec, environment=own | {"wrappers": [{"gymnasium.wrappers:ClipAction": {}}]}),
+        replace(spec, environment=own | {"wrappers": [{"gymnasium.wrappers:ClipReward": {"max_reward": 1}}]}),
     ]
     for number, other in enumerate(specs, 1):
-        assert [comparison.random_returns(other, path).tolist() for _ in range(2)] == [[number], [number]]
-    assert comparison.random_returns(replace(specs[-1], seed=3, algorithm="gac"), path).tolist() == [len(specs)]
-    path.write_text("[5.0]")
-    assert comparison.random_returns(spec, path).tolist() == [len(specs) + 1], "a file of an earlier version says not of what"
+        expected = {"random actions": [2 * number - 1], "the middle action": [2 * number]}
+        assert comparison.untrained_returns(other, path) == comparison.untrained_returns(other, path) == expected
+    assert comparison.untrained_returns(replace(specs[-1], seed=3, algorithm="gac"), path) == expected
+
+
+def test_policies_without_training_by_hand(tmp_path):
+    own = {"id": f"{__name__}:MiddleWins", "kwargs": {}, "wrappers": []}
+    spec = RunSpec("sac", "x", 0.0, 0, 60, 2, "small", 20, 3, environment=own)
+    returns = comparison.untrained_returns(spec, tmp_path / "untrained.json")
+    assert set(returns["the middle action"]) == {5.0}
+    assert max(returns["random actions"]) < 5
+    assert {len(of_episodes) for of_episodes in returns.values()} == {30}
+    without_middle = own | {"id": f"{__name__}:Numbers"}, own | {"wrappers": [{"gymnasium.wrappers:ClipAction": {}}]}
+    for number, other in enumerate(without_middle):
+        returns = comparison.untrained_returns(replace(spec, environment=other), tmp_path / f"{number}.json")
+        assert list(returns) == ["random actions"]
 
 
 def test_a_history_of_the_newest_observation_alone_is_none():

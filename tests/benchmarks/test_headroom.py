@@ -20,7 +20,7 @@ from benchmarks.headroom import (
 )
 from benchmarks.tidy import NO_NOISE
 
-RANDOM = np.array([-2.0, 0.0, 2.0, 0.0])
+RANDOM = {"random actions": np.array([-2.0, 0.0, 2.0, 0.0])}
 
 
 def _tidy(ends, steps=(100, 200, 300, 400), start=0.0):
@@ -39,7 +39,7 @@ def _worth(**ends):
     return worth(_tidy({name.replace("_", "-"): values for name, values in ends.items()}), RANDOM)
 
 
-def test_a_run_ends_with_its_last_quarter_and_is_measured_from_random_actions():
+def test_a_run_ends_with_its_last_quarter_and_is_measured_from_a_policy_without_training():
     tidy = _tidy({"sac": [8.0, 10.0]}, steps=tuple(range(8)), start=-4.0)
     found = worth(tidy, RANDOM)
     assert found.ends["sac"].tolist() == [2.0, 3.0], "the mean of the last two of eight evaluations"
@@ -54,10 +54,10 @@ def test_clear_results_are_told():
     assert headroom.startswith("There is headroom.")
     assert "40.0 (37.7 to 42.3 with 95% confidence; 40% of what was learned)" in headroom
     assert in_training.startswith("Privileged information in training alone is worth 40.0")
-    assert guider.startswith("A guider changes nothing")
+    assert guider.startswith("A guider changes next to nothing on top of such critics, 0 (-2.27 to 2.27 with 95% confidence")
     assert recommendation(found, 1000) == [
         "Train with SAC-asym.",
-        "It is the simplest of those that do best: GAC comes equally far.",
+        "It is the simplest of those that do best: GAC comes about equally far.",
         "Since there is headroom, try what shows the policy more: the History wrapper, a recurrent policy, another sensor.",
     ]
 
@@ -108,6 +108,15 @@ def test_where_nothing_was_learned_that_is_all_that_is_said():
     first, second = recommendation(found, 5000)
     assert "nothing was learned in 5,000 steps" in first
     assert second == "Give more --steps, or another --preset."
+
+
+def test_the_best_policy_without_training_is_the_floor():
+    tidy = _tidy({"sac-full": [9.0, 11.0], "sac-asym": [4.5, 5.5]})
+    found = worth(tidy, RANDOM | {"the middle action": np.array([3.0, 5.0])})
+    assert (found.floor, found.span) == ("the middle action", 10.0 - 4.0)
+    assert found.learned == [], "its interval ends at 16.7"
+    assert "No algorithm ends above the return of the middle action without training, 4.00:" in recommendation(found, 1)[0]
+    assert worth(tidy, RANDOM | {"the middle action": np.full(2, -1.0)}).floor == "random actions"
 
 
 def test_the_headroom_at_each_step():
