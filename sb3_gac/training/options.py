@@ -284,7 +284,7 @@ def _check_teacher(options: Namespace) -> None:
         raise ValueError(f"--teacher: {kind.__name__} has none.")
     if options.teacher is not None:
         try:
-            options.teacher = model_file(options.teacher)
+            options.teacher = model_file(options.teacher).absolute()  # the run may be resumed in another folder
         except FileNotFoundError as error:
             raise ValueError(f"--teacher: {error}") from None
 

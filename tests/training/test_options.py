@@ -99,13 +99,15 @@ def test_every_algorithm_without_a_teacher_can_be_made(algorithm, tmp_path):
     assert parse_arguments(["--resume", str(job.directory)]).algorithm == algorithm
 
 
-def test_a_teacher_is_the_file_of_another_run(tmp_path):
+def test_a_teacher_is_the_file_of_another_run(tmp_path, monkeypatch):
     prepare(parse_arguments(["--env", OWN, "--runs", str(tmp_path)])).model.save(tmp_path / "teacher.zip")
     arguments = ["--env", OWN, "--algorithm", "cosil", "--runs", str(tmp_path), "--teacher"]
     job = prepare(parse_arguments([*arguments, str(tmp_path / "teacher.zip")]))
     assert job.model.teacher == str(tmp_path / "teacher.zip")
     assert parse_arguments([*arguments, str(tmp_path / "teacher")]).teacher == tmp_path / "teacher.zip"
     assert str(parse_arguments(["--resume", str(job.directory)]).teacher) == job.model.teacher
+    monkeypatch.chdir(tmp_path)
+    assert parse_arguments([*arguments, "teacher.zip"]).teacher == tmp_path / "teacher.zip"
 
 
 def test_an_environment_of_ones_own_has_its_arguments_and_a_history_on_request(tmp_path):
