@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch as th
 import yaml
-from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from benchmarks import aggregate, launch
@@ -27,7 +26,7 @@ from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 from sb3_gac.optim.compile import PAYS_FROM, missing_compiler
 from sb3_gac.presets import PRESETS, read_preset
-from sb3_gac.training.evaluation import MiddleAction, UniformActions
+from sb3_gac.training.evaluation import untrained_policies
 from sb3_gac.training.options import from_yaml, mapping, positive
 
 ALGORITHMS = (FULL, ASYMMETRIC, GUIDED, PARTIAL)
@@ -246,11 +245,8 @@ def untrained_returns(spec: RunSpec, path: Path) -> dict[str, np.ndarray]:
 
 def _untrained_returns(spec: RunSpec) -> dict[str, list[float]]:
     env = make_envs(spec, spec.eval_episodes)
-    policies: dict[str, Any] = {"random actions": UniformActions(env)}
-    if isinstance(env.action_space, spaces.Box) and env.action_space.is_bounded():
-        policies["the middle action"] = MiddleAction(env)
     returns: dict[str, Any] = {}
-    for name, policy in policies.items():
+    for name, policy in untrained_policies(env).items():
         env.seed(EVAL_SEED)
         returns[name], _ = evaluate_policy(policy, env, UNTRAINED_EPISODES, return_episode_rewards=True)
     env.close()

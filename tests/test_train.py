@@ -1,5 +1,6 @@
 """The main job, end to end on a tiny budget."""
 
+import itertools
 import json
 import re
 import shlex
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, GuiderLearnerEvalCallback
@@ -47,7 +49,7 @@ def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_pat
     assert configuration["versions"].keys() >= {"python", "sb3_gac", "stable-baselines3", "torch", "gymnasium", "mujoco"}
     assert re.match(r"[0-9a-f]{40}(\+changes)?$|$", configuration["commit"])
     results = json.loads((directory / "results.json").read_text())
-    assert np.isfinite([results["learner"], results["random"]]).all()
+    assert np.isfinite([results["learner"], *itertools.chain(*results["untrained"].values())]).all()
     assert results["compiled"] is False
     assert [row["timesteps"] for row in results["history"]] == list(range(240, 2401, 240))
     output = capsys.readouterr().out
@@ -56,7 +58,9 @@ def test_main_job_leaves_a_model_a_picture_results_and_its_configuration(tmp_pat
     assert len(re.findall(r"^ *[\d,]+ of 2,400 steps: learner [\d.]+, guider [\d.]+", output, re.MULTILINE)) == 10
     assert "(noise 0.1, history 4) for 2,400 steps in" in output
     assert f"return {results['learner']:.3g} +- {results['learner_std']:.3g} over 2 episodes" in output
-    assert f"same seeds: {results['random']:.3g} +- {results['random_std']:.3g}." in output
+    (drawn, drawn_std), (middle, middle_std) = results["untrained"].values()
+    without_training = f"random actions {drawn:.3g} +- {drawn_std:.3g}, the middle action {middle:.3g} +- {middle_std:.3g}"
+    assert f"Without training, same seeds: {without_training}." in output
     assert f'GAC.load("{directory / "model"}")' in output
     action, _ = GAC.load(directory / "model").predict({"partial": np.zeros(4 * 5 + 3, np.float32)}, deterministic=True)
     assert action.shape == (1,)
@@ -188,7 +192,7 @@ def test_a_run_that_is_stopped_says_how_to_go_on_and_ends_as_if_it_had_not_been(
     (undisturbed,) = (tmp_path / "undisturbed").iterdir()
     assert {path.name for path in directory.iterdir()} == {path.name for path in undisturbed.iterdir()}
     found, expected = (json.loads((path / "results.json").read_text()) for path in (directory, undisturbed))
-    for name in ("learner", "learner_std", "random", "steps"):
+    for name in ("learner", "learner_std", "untrained", "steps"):
         assert found[name] == expected[name]
     for name in ("timesteps", "learner", "guider"):
         assert [row[name] for row in found["history"]] == [row[name] for row in expected["history"]]
@@ -377,21 +381,26 @@ def test_results_are_those_of_each_policy_over_as_many_episodes_as_asked(tmp_pat
 
     def evaluated(policy, env, n_eval_episodes):
         asked.append((type(policy).__name__, n_eval_episodes, env.seeds.pop()))
-        return {"DeployedView": (1.0, 2.0), "UniformActions": (3.0, 4.0)}[asked[-1][0]]
+        return {"DeployedView": (1.0, 2.0), "UniformActions": (3.0, 4.0), "MiddleAction": (5.0, 6.0)}[asked[-1][0]]
 
     policy = SimpleNamespace(deployed_entries=["partial", "gear"])
     model = SimpleNamespace(save=Path.touch, num_timesteps=7, compiles=True, learning_starts=5, policy=policy)
-    space = SimpleNamespace(seed=lambda seed: None)
     seeds, drawn = [], []
-    env = SimpleNamespace(seeds=seeds, seed=seeds.append, action_space=space, num_envs=1)
+    env = SimpleNamespace(seeds=seeds, seed=seeds.append, action_space=spaces.Box(-1, 1, (2,)), num_envs=1)
     monkeypatch.setattr(evaluation, "evaluate_policy", evaluated)
     monkeypatch.setattr(job, "draw_learning_curve", lambda *args: drawn.extend(args))
     (tmp_path / "checkpoints").mkdir()
     finish(Job(parse_arguments(["--episodes", "3"]), tmp_path, model, env), [], 1.5)
-    assert asked == [("DeployedView", 3, 10_000), ("UniformActions", 3, 10_000)]
-    assert drawn[-3:] == [3.0, 5, "partial and gear"], "the return of random actions, the warm-up, and what the learner reads"
+    assert asked == [("DeployedView", 3, 10_000), ("UniformActions", 3, 10_000), ("MiddleAction", 3, 10_000)]
+    untrained = {"random actions": (3.0, 4.0), "the middle action": (5.0, 6.0)}
+    assert drawn[-3:] == [
+        untrained,
+        5,
+        "partial and gear",
+    ], "without training, the warm-up, what the learner reads"
     results = json.loads((tmp_path / "results.json").read_text())
-    assert [results.pop(name) for name in ("learner", "learner_std", "random", "random_std")] == [1.0, 2.0, 3.0, 4.0]
+    assert [results.pop(name) for name in ("learner", "learner_std")] == [1.0, 2.0]
+    assert results.pop("untrained") == {"random actions": [3.0, 4.0], "the middle action": [5.0, 6.0]}
     assert results == {"steps": 7, "minutes": 1.5, "compiled": True, "history": []}
     assert not (tmp_path / "checkpoints").exists()
 

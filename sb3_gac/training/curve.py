@@ -1,5 +1,6 @@
 """The learning curve of a run, as a picture."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ def draw_learning_curve(
     history: Sequence[Mapping[str, float]],
     title: str,
     path: Path,
-    random: float | None = None,
+    untrained: Mapping[str, tuple[float, float]] | None = None,
     warm_up: float = 0,
     seen: str = PARTIAL,
 ) -> None:
@@ -24,7 +25,8 @@ def draw_learning_curve(
         :class:`sb3_gac.SeededEvalCallback`
     :param title: title of the figure
     :param path: path of the picture
-    :param random: mean return of random actions, drawn as a line; ``None`` for no line
+    :param untrained: name of a policy without training -> mean and standard deviation of its returns, of which the mean is
+        drawn as a line; ``None`` for no lines
     :param warm_up: number of environment steps with random actions at the start, drawn as a shaded area
     :param seen: entries that the learner reads, in words
     """
@@ -38,8 +40,8 @@ def draw_learning_curve(
     returns.plot(steps, [row["learner"] for row in history], label=f"learner ({seen} alone)", marker="o")
     if any("guider" in row for row in history):
         returns.plot(steps, [row.get("guider", np.nan) for row in history], label="guider (privileged)", linestyle="--")
-    if random is not None:
-        returns.axhline(random, color="gray", linestyle=":", label="random actions")
+    for (name, (mean, _)), style in zip((untrained or {}).items(), itertools.cycle([":", "-."])):
+        returns.axhline(mean, color="gray", linestyle=style, label=name)
     returns.set(ylabel="return, mean of an evaluation's episodes")
     if with_kl:
         kl = axes[0, 1]

@@ -172,7 +172,8 @@ def summary(directory: Path, options: Namespace, entries: Sequence[str] = (PARTI
     """
     results = json.loads((directory / RESULTS).read_text())
     name = algorithm_class(options.algorithm).__name__
-    learner, random = (f"{shown(results[key])} +- {shown(results[f'{key}_std'])}" for key in ("learner", "random"))
+    learner = f"{shown(results['learner'])} +- {shown(results['learner_std'])}"
+    untrained = ", ".join(f"{name} {shown(mean)} +- {shown(std)}" for name, (mean, std) in results["untrained"].items())
     observation = ", ".join(f'"{key}": {"observation" if len(entries) == 1 else f"observation[{key!r}]"}' for key in entries)
     statistics = directory / STATISTICS
     normalised = (
@@ -184,7 +185,7 @@ The observation is to be normalised by {statistics}, as in training; a file of `
     return f"""
 Trained {name} on {in_words(options)} for {results["steps"]:,} steps in {results["minutes"]:.1f} minutes.
 Learner, seeing {" and ".join(f"`{key}`" for key in entries)} alone: return {learner} over {options.episodes} episodes.
-Random actions, same seeds: {random}.
+Without training, same seeds: {untrained}.
 Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:
     from sb3_gac import {name}; model = {name}.load("{directory / MODEL}")
     action, _ = model.predict({{{observation}}}, deterministic=True){normalised}"""

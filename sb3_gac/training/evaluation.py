@@ -59,6 +59,20 @@ class MiddleAction:
         return self._actions.copy(), state
 
 
+def untrained_policies(env: VecEnv) -> dict[str, Any]:
+    """
+    Policies without training, whose returns a trained policy must leave behind. On tasks that reward a robot for standing,
+    or punish strong actions, the middle action is better than random actions.
+
+    :param env: vectorised environments
+    :return: name in sentences -> policy: random actions, and the middle action where the actions have a middle
+    """
+    policies: dict[str, Any] = {"random actions": UniformActions(env)}
+    if isinstance(env.action_space, spaces.Box) and env.action_space.is_bounded():
+        policies["the middle action"] = MiddleAction(env)
+    return policies
+
+
 def evaluate(policy: Any, env: VecEnv, episodes: int) -> tuple[float, float]:
     """
     Evaluate a policy on episodes that start from the seed ``EVAL_SEED``.

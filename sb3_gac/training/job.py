@@ -34,7 +34,7 @@ from sb3_gac.training.directory import (
     write_configuration,
 )
 from sb3_gac.training.environments import STATISTICS, find_modules_here, make_envs, normalized
-from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, UniformActions, evaluate
+from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, evaluate, untrained_policies
 from sb3_gac.training.options import EPISODES_ON_THE_WAY, algorithm_arguments
 from sb3_gac.training.progress import Progress
 
@@ -207,15 +207,14 @@ def finish(job: Job, history: list[dict[str, float]], minutes: float) -> None:
         sync_envs_normalization(of_training, eval_env)
     _save(model, directory / f"{MODEL}.zip")
     learner, learner_std = evaluate(DeployedView(model), eval_env, options.episodes)
-    random, random_std = evaluate(UniformActions(eval_env), eval_env, options.episodes)
+    untrained = {name: evaluate(policy, eval_env, options.episodes) for name, policy in untrained_policies(eval_env).items()}
     warm_up = getattr(model, "learning_starts", 0)
     title, seen = _title(options, model), " and ".join(model.policy.deployed_entries)
-    draw_learning_curve(history, title, directory / "learning_curve.png", random, warm_up, seen)
+    draw_learning_curve(history, title, directory / "learning_curve.png", untrained, warm_up, seen)
     results = {
         "learner": learner,
         "learner_std": learner_std,
-        "random": random,
-        "random_std": random_std,
+        "untrained": untrained,
         "steps": model.num_timesteps,
         "minutes": minutes,
         "compiled": model.compiles,

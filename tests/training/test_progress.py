@@ -103,7 +103,7 @@ def test_durations_and_returns_are_short():
 
 
 @pytest.mark.parametrize("with_guider", [True, False])
-def test_the_curve_marks_warm_up_and_random_actions(with_guider, tmp_path, monkeypatch):
+def test_the_curve_marks_warm_up_and_policies_without_training(with_guider, tmp_path, monkeypatch):
     from matplotlib import pyplot as plt
 
     kept = []
@@ -112,16 +112,18 @@ def test_the_curve_marks_warm_up_and_random_actions(with_guider, tmp_path, monke
     if with_guider:
         rows = [row | {"guider": 2.0} for row in rows]
         rows[-1] |= {"kl": 0.1, "target_kl": 0.2}
-    draw_learning_curve(rows, "GAC", tmp_path / "curve.png", random=-3.0, warm_up=2000)
+    draw_learning_curve(
+        rows, "GAC", tmp_path / "curve.png", {"random actions": (-3.0, 0.1), "the middle action": (-1.0, 0.2)}, 2000
+    )
     (figure,) = kept
     monkeypatch.undo()
     returns, *others = figure.axes
     assert len(others) == with_guider
     labels = {handle.get_label(): handle for handle in returns.get_legend_handles_labels()[0]}
-    assert set(labels) == {"learner (partial alone)", "random actions", "warm-up"} | (
+    assert set(labels) == {"learner (partial alone)", "random actions", "the middle action", "warm-up"} | (
         {"guider (privileged)"} if with_guider else set()
     )
-    assert set(labels["random actions"].get_ydata()) == {-3.0}
+    assert [set(labels[name].get_ydata()) for name in ("random actions", "the middle action")] == [{-3.0}, {-1.0}]
     of_kl = {line.get_label(): list(line.get_ydata())[-1] for axis in others for line in axis.get_lines()}
     assert of_kl == ({"KL(guider ‖ learner)": 0.1, "target": 0.2} if with_guider else {})
     assert labels["warm-up"].get_extents().transformed(returns.transData.inverted()).x1 == pytest.approx(2000)
