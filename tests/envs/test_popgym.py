@@ -81,6 +81,25 @@ def test_concentration_tells_the_faces_that_were_seen(level, n_cards, n_faces):
     assert set(seen.values()) == set(range(n_faces))
 
 
+@pytest.mark.parametrize(("level", "n_cards"), [("Easy", 52), ("Medium", 104), ("Hard", 52)])
+def test_concentration_tells_on_request_what_lies_on_the_table(level, n_cards):
+    """Against a game played from its rules alone: two cards are turned, and stay if their faces are the same."""
+    found, first, seen_planes = set(), None, set()
+    for game, obs, action, *_ in _play(f"Concentration{level}", _random, table=True):
+        planes = obs["privileged"][-2 * n_cards :].reshape(2, n_cards)
+        assert [set(np.flatnonzero(plane)) for plane in planes] == [found, {first} - {None}]
+        seen_planes.add((bool(found), first is not None))
+        card, face = int(action), game.deck_idx_type[game.deck.idx]
+        if card in found:
+            first = None  # and the turn is over
+        elif first is None:
+            first = card
+        else:
+            found |= {first, card} if first != card and face[first] == face[card] else set()
+            first = None
+    assert len(seen_planes) == 4 or level == "Hard", "with and without pairs, with and without a first card"
+
+
 @pytest.mark.parametrize(("level", "n_cards"), [("Easy", 52), ("Medium", 104), ("Hard", 156)])
 def test_autoencode_tells_no_card_before_all_were_shown_and_then_the_last_one_left(level, n_cards):
     shown, told = [], []

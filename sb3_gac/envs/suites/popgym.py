@@ -114,24 +114,36 @@ class SeenFaces(Summary):
     """
     Concentration: the face that was last seen at each position, or that none was seen.
 
+    The faces do not tell which pairs were found, and whether the next card is the first or the second of a pair. Observations
+    tell it to a player who remembers, so critics without a memory need ``table``.
+
     :param game: game of POPGym
+    :param table: whether to show the cards of found pairs and the first card of the next pair as well
     """
 
-    def __init__(self, game: Any):
+    def __init__(self, game: Any, table: bool = False):
         super().__init__(game)
+        self._table = table
         self._n_faces = int(game.facedown_card) + 1
-        self.size = game.deck.num_cards * self._n_faces
+        self.size = game.deck.num_cards * (self._n_faces + 2 * table)
         self._seen = np.empty(0, dtype=np.int64)
 
     def of(self, observation: Any) -> np.ndarray:
         """
         :param observation: face of each card, ``facedown_card`` where it is hidden, shape (number of cards,)
-        :return: one-hot face for each position, shape (size,)
+        :return: one-hot face for each position, then, with ``table``, 1 for each card of a found pair, and 1 for the first
+            card of the next pair, if it was turned, shape (size,)
         """
+        cards, hidden = self.game.deck, self.game.facedown_card
         if self.game.curr_step == 0:
-            self._seen = np.full(self.game.deck.num_cards, self.game.facedown_card, dtype=np.int64)
-        self._seen = np.where(observation == self.game.facedown_card, self._seen, observation)
-        return _one_hot(self._seen, self._n_faces)
+            self._seen = np.full(cards.num_cards, hidden, dtype=np.int64)
+        self._seen = np.where(observation == hidden, self._seen, observation)
+        faces = _one_hot(self._seen, self._n_faces)
+        if not self._table:
+            return faces
+        planes = np.zeros((2, cards.num_cards), dtype=np.float32)
+        planes[0, cards["face_up_idx"]] = planes[1, cards["in_play_idx"]] = 1.0
+        return np.concatenate([faces, *planes])
 
 
 class ViewedSquares(Summary):
@@ -210,7 +222,7 @@ def make_popgym(task: str, previous_reward: bool = False, **summary: Any) -> gym
 
     :param task: name of the task, one of ``TASKS``
     :param previous_reward: whether ``partial`` has the previous reward beside the previous action
-    :param summary: keyword arguments of the game's summary, such as ``hits=True`` for Battleship
+    :param summary: keyword arguments of the game's summary, ``hits=True`` for Battleship, ``table=True`` for Concentration
     :return: environment with ``partial`` and ``privileged``
     :raises ValueError: if the task is unknown
     :raises ImportError: if POPGym is not installed; the message says how to install it
