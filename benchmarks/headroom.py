@@ -32,6 +32,8 @@ SIMPLER_FIRST = (PARTIAL, ASYMMETRIC, GUIDED)
 END = 0.25
 #: Share of the learned return below which a difference does not matter
 NEGLIGIBLE = 0.05
+#: Number of seeds above which a comparison had better have more steps
+MANY_SEEDS = 20
 #: Share of the learned return that the recommended number of seeds shows in four of five repetitions
 WORTH_SEEING, _POWER_QUANTILES = 0.1, float(stats.norm.ppf(0.975) + stats.norm.ppf(0.8))
 
@@ -212,23 +214,40 @@ def recommendation(found: Worth, steps: int) -> list[str]:
 
 
 def _choice(found: Worth) -> Sequence[str]:
+    """
+    The simplest algorithm of those that end as far as the best, or that can't be told from it and are behind by less than
+    would be worth seeing. One that is further behind, if only by chance, is no choice for few seeds.
+    """
     names = found.deployable
     if not names:
         return ["None of these algorithms can be deployed without the privileged entries."]
     best = max(names, key=lambda name: float(found.ends[name].mean()))
-    behind = {name: difference(found.ends, best, name) for name in names if name != best}
-    tied = [name for name in names if name == best or behind[name].verdict(NEGLIGIBLE * found.span) in ("same", "unknown")]
-    chosen = tied[0]
-    text = f"Train with {title(chosen)}."
-    if tied == [best] and len(names) > 1:
-        return [text, f"It ends above {listed([title(name) for name in names if name != best])}, beyond chance."]
-    if len(tied) > 1:
-        others = listed([title(name) for name in tied[1:]])
-        sure = all(difference(found.ends, name, chosen).verdict(NEGLIGIBLE * found.span) == "same" for name in tied[1:])
-        comes = "comes" if len(tied) == 2 else "come"
+    behind = {name: difference(found.ends, best, name) for name in names}
+    verdicts = {name: one.verdict(NEGLIGIBLE * found.span) for name, one in behind.items()}
+    unknown = [name for name in names if name != best and verdicts[name] == "unknown"]
+    lower = [name for name in unknown if behind[name].value > WORTH_SEEING * found.span]
+    near = [name for name in names if verdicts[name] in ("same", "unknown") and name not in lower]
+    told = [f"Train with {title(near[0])}.", *_why(found, near, lower)]
+    if near == [best] and not lower and len(names) > 1:
+        told.append(f"It ends above {listed([title(name) for name in names if name != best])}, beyond chance.")
+    return told
+
+
+def _why(found: Worth, near: Sequence[str], lower: Sequence[str]) -> list[str]:
+    """Sentences on the algorithms that end near the chosen one, the first, and on those that end lower, maybe by chance."""
+    chosen, *others = near
+    reasons = []
+    if others:
+        sure = all(difference(found.ends, name, chosen).verdict(NEGLIGIBLE * found.span) == "same" for name in others)
+        comes = "comes" if len(others) == 1 else "come"
         why = f"{comes} about equally far" if sure else "can't be told from it with these seeds"
-        return [text, f"It is the simplest of those that do best: {others} {why}."]
-    return [text]
+        reasons.append(f"It is the simplest of those that do best: {listed([title(name) for name in others])} {why}.")
+    if lower:
+        end = "ends" if len(lower) == 1 else "end"
+        reasons.append(
+            f"{listed([title(name) for name in lower])} {end} lower on average, which may be chance with these seeds."
+        )
+    return reasons
 
 
 def _next_steps(found: Worth) -> Sequence[str]:
@@ -243,6 +262,8 @@ def _next_steps(found: Worth) -> Sequence[str]:
         size = f"a difference of {WORTH_SEEING:.0%} of what was learned"
         if needed > least:
             hints.append(f"What can't be told is a matter of seeds: {needed} of each algorithm would most likely show {size}.")
+            if needed > MANY_SEEDS:
+                hints.append("These are many. Runs that have learned more often differ less, so try more --steps first.")
         else:
             hints.append(f"What can't be told is small: {least} seeds would most likely have shown {size}.")
     if found.headroom is not None and found.headroom.verdict(NEGLIGIBLE * found.span) == "more":
