@@ -36,9 +36,9 @@ _FRAME = {
 #: First part of training whose returns the axis need not hold
 HIDDEN = 0.25
 _RETURNS = (
-    "Mean return of what is deployed, over all seeds. Bands hold the mean with 95% confidence by Student's t; thin lines are "
-    "the seeds, dashes the guider. A click on a name switches it off. The axis fits the last three quarters of training; a "
-    "double click shows all."
+    "Mean return of what is deployed, over all seeds. Bands hold the mean with 95% confidence by Student's t; those of two "
+    "seeds would hide the plot, and are in the table alone. Thin lines are the seeds, dashes the guider. A click on a name "
+    "switches it off. The axis fits the last three quarters of training; a double click shows all."
 )
 _HEADROOM = (
     "Headroom over training: SAC on the full state over SAC-asym at the same step, with its interval. Above 0, seeing more "
@@ -78,7 +78,8 @@ def _curves(tidy: pd.DataFrame, floor: str, floor_return: float) -> graph_object
     figure = graph_objects.Figure()
     tidy = tidy.assign(algorithm=tidy.algorithm.map(title))
     for algorithm, color in palette(list(tidy.algorithm.unique())).items():
-        lines = algorithm_lines(tidy[tidy.algorithm == algorithm], algorithm, color)
+        runs = tidy[tidy.algorithm == algorithm]
+        lines = [line for line in algorithm_lines(runs, algorithm, color) if not line.fill or runs.seed.nunique() > 2]
         for line in lines:
             line.showlegend = line.name == algorithm
         figure.add_traces(lines)

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from gymnasium import spaces
 
-from benchmarks import comparison, launch
+from benchmarks import comparison, comparison_page, launch
 from benchmarks.comparison import command, main, parse_arguments, suite_of_options
 from benchmarks.run import run
 from benchmarks.suite import RunSpec, read_suite
@@ -128,6 +129,20 @@ def test_a_comparison_from_its_command_to_its_page(engine, monkeypatch, tmp_path
     assert engine.made == 5, "the first seed is there already"
     _compare(monkeypatch, *SHORT, "--seeds", 2, "--algorithms", "sac")
     assert engine.made == 5
+
+
+@pytest.mark.parametrize(("seeds", "bands"), [(2, 0), (3, 2)])
+def test_the_axis_fits_late_returns_and_bands_need_three_seeds(seeds, bands):
+    rows = [
+        {"algorithm": name, "seed": seed, "timesteps": step, "learner": -900.0 if step == 1 else step + seed}
+        for name in ("sac", "gac")
+        for seed in range(seeds)
+        for step in range(1, 13)
+    ]
+    figure = comparison_page._curves(pd.DataFrame(rows), "random actions", -5.0)
+    assert len([line for line in figure.data if line.fill]) == bands
+    margin = 0.08 * (12 + seeds - 1 + 5)
+    assert figure.layout.yaxis.range == pytest.approx((-5 - margin, 12 + seeds - 1 + margin))
 
 
 def test_the_command_on_the_page_is_the_same_comparison():
