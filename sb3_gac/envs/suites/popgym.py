@@ -115,7 +115,7 @@ class SeenFaces(Summary):
     Concentration: the face that was last seen at each position, or that none was seen.
 
     The faces do not tell which pairs were found, and whether the next card is the first or the second of a pair. Observations
-    tell it to a player who remembers, so critics without a memory need ``table``.
+    tell it to a player who remembers; ``table`` tells it at once.
 
     :param game: game of POPGym
     :param table: whether to show the cards of found pairs and the first card of the next pair as well
