@@ -169,8 +169,8 @@ def in_order(
     jobs: Sequence[Job], at_once: int, submit: Callable[[Job], "Future[None]"], tell: Callable[[Job], None]
 ) -> Iterator["Future[None]"]:
     """
-    Submit jobs in their order as others end. A job leaves its place to the next until the jobs that it needs have ended; if one
-    of these failed, the job is not submitted.
+    Submit jobs in their order as others end. A job leaves its place to the next until the jobs that it needs have ended; if
+    one of these failed, the job is not submitted.
 
     :param jobs: jobs of the runs to make
     :param at_once: number of jobs side by side
