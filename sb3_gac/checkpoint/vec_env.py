@@ -5,7 +5,7 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize, VecTransposeImage
 
-from sb3_gac.envs.state import NotRestorableError, env_state, restore_env_state
+from sb3_gac.envs.state import NotRestorableError, env_state, layers, restore_env_state, restore_settings, settings_of
 
 #: Wrapper -> the attributes that change from step to step
 CHANGING: dict[type, tuple[str, ...]] = {
@@ -21,8 +21,8 @@ def vec_env_state(env: VecEnv) -> dict[str, Any]:
 
     :param env: vectorised environments, between two steps
     :return: dict with "names" of all wrappers, outermost first; "wrappers", the changing attributes of each (none of an
-        unknown wrapper); "episodes", the state of each environment, or ``None`` if episodes can't be taken up again; and
-        "why", the reason for that, else empty
+        unknown wrapper); "episodes", the state of each environment, or ``None`` if episodes can't be taken up again;
+        "why", the reason for that, else empty; and "settings", those of all layers in this process, which are kept even then
     """
     wrappers, inner = _unwrap(env)
     unknown = [type(wrapper).__name__ for wrapper in wrappers if type(wrapper) not in CHANGING]
@@ -37,7 +37,8 @@ def vec_env_state(env: VecEnv) -> dict[str, Any]:
         episodes, why = _episodes(inner), ""
     except NotRestorableError as error:
         episodes, why = None, str(error)
-    return {"names": names, "wrappers": known, "episodes": episodes, "why": why}
+    settings = [settings_of(layer) for layer in _layers(inner)]
+    return {"names": names, "wrappers": known, "episodes": episodes, "why": why, "settings": settings}
 
 
 def restore_vec_env_state(env: VecEnv, state: dict[str, Any]) -> str:
@@ -58,13 +59,22 @@ def restore_vec_env_state(env: VecEnv, state: dict[str, Any]) -> str:
     for wrapper, attributes in zip(wrappers, state["wrappers"], strict=True):
         for name, value in attributes.items():
             setattr(wrapper, name, value)
-    if state["episodes"] is None:
-        return state["why"]
     try:
+        if state["episodes"] is None:
+            raise NotRestorableError(state["why"])
         _restore_episodes(inner, state["episodes"])
     except NotRestorableError as error:
+        for layer, settings in zip(
+            _layers(inner), state.get("settings", []), strict=False
+        ):  # files of earlier versions have none
+            restore_settings(layer, settings)
         return str(error)
     return ""
+
+
+def _layers(inner: Any) -> list[Any]:
+    """The vectorised environments themselves, and the layers of each environment in this process."""
+    return [inner, *(layer for one in getattr(inner, "envs", ()) for layer in layers(one))]
 
 
 def _episodes(inner: Any) -> Any:

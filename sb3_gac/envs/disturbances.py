@@ -44,6 +44,7 @@ class SensorDelay(EntryWrapper):
     def __init__(self, env: gym.Env, steps: int, key: str = PARTIAL):
         super().__init__(env, key)
         self._steps = self._checked(steps)
+        self._settings_made_with = {"steps": self.steps}
         self._values: deque[np.ndarray] = deque(maxlen=self.steps + 1)
 
     @staticmethod
@@ -87,12 +88,22 @@ class DroppedFrames(EntryWrapper):
 
     def __init__(self, env: gym.Env, probability: float, key: str = PARTIAL):
         super().__init__(env, key)
+        self.probability = probability
+        self._settings_made_with = {"probability": self.probability}
+        self._generator = np.random.default_rng()
+        self._shown = np.empty(0)
+
+    @property
+    def probability(self) -> float:
+        """Probability that a value is lost, from the next step on."""
+        return self._probability
+
+    @probability.setter
+    def probability(self, probability: float) -> None:
         is_number = isinstance(probability, (int, float, np.integer, np.floating)) and not isinstance(probability, bool)
         if not is_number or not 0 <= probability <= 1:
             raise ValueError(f"probability must be a number from 0 to 1, with which a value is lost, got {probability!r}.")
-        self.probability = float(probability)
-        self._generator = np.random.default_rng()
-        self._shown = np.empty(0)
+        self._probability = float(probability)
 
     @property
     def _stream(self) -> list[int]:

@@ -52,6 +52,8 @@ CHANGING: dict[str, tuple[str, ...]] = {
 #: Flags of gymnasium's checker that are set when a state is restored: an episode's first steps were checked before
 _CHECKED = ("checked_reset", "checked_step", "checked_data_reuse")
 _MUJOCO = "mujoco"  # key of the state of MuJoCo's model and data in a layer's state
+MADE_WITH = "_settings_made_with"  # attribute of layers with settings, see settings_of
+_SETTINGS = "settings"  # key of the settings in a layer's state
 #: Attributes that a reset draws, and prefixes of the arrays in MuJoCo's model that a reset may change, beside its options
 _DRAWN = ("goal",)
 _ADDRESSES = ("plugin_data",)  # memory addresses of plugins' data, which another process can't use
@@ -122,10 +124,21 @@ def _layer_state(layer: gym.Env) -> dict[str, Any]:
         )
     if not isinstance(layer, gym.Wrapper) and layer._np_random is not None:
         state["np_random"] = deepcopy(layer._np_random)
+    if settings := settings_of(layer):
+        state[_SETTINGS] = settings
     return state
 
 
 def _restore_layer(layer: gym.Env, state: dict[str, Any]) -> None:
+    settings = state.pop(_SETTINGS, {})
+    restore_settings(layer, settings)
+    _restore_values(layer, state)
+    if not _made_alike(layer, settings):
+        for name in vars(layer).get(MADE_WITH, ()):  # what was drawn or kept under other settings does not count
+            setattr(layer, name, getattr(layer, name))
+
+
+def _restore_values(layer: gym.Env, state: dict[str, Any]) -> None:
     if "np_random" in state:
         layer.np_random = state.pop("np_random")
     if hasattr(type(layer), "restore_checkpoint_state"):
@@ -138,6 +151,36 @@ def _restore_layer(layer: gym.Env, state: dict[str, Any]) -> None:
         for attribute, value in state.items():
             now = getattr(layer, attribute, None)
             setattr(layer, attribute, deque(value, maxlen=now.maxlen) if isinstance(now, deque) else value)
+
+
+def settings_of(layer: Any) -> dict[str, dict[str, Any]]:
+    """
+    Settings that may be set anew during training, such as a noise that grows with the policy's skill.
+
+    :param layer: environment, wrapper or vectorised environment; its attribute ``_settings_made_with`` has the settings that
+        it was made with, by name, and each of them is an attribute too
+    :return: the settings "made_with" and "now"; an empty dict if the layer has none
+    """
+    made_with = vars(layer).get(MADE_WITH)
+    now = {name: getattr(layer, name) for name in made_with or ()}
+    return deepcopy({"made_with": made_with, "now": now}) if made_with else {}
+
+
+def restore_settings(layer: Any, settings: dict[str, dict[str, Any]]) -> None:
+    """
+    Set the settings that a layer had, unless it was made with others: whoever made it wants those.
+
+    :param layer: environment, wrapper or vectorised environment
+    :param settings: what :func:`settings_of` returned; an empty dict, as of earlier versions, changes nothing
+    """
+    if _made_alike(layer, settings):
+        for name, value in settings.get("now", {}).items():
+            setattr(layer, name, value)
+
+
+def _made_alike(layer: Any, settings: dict[str, dict[str, Any]]) -> bool:
+    made_with = vars(layer).get(MADE_WITH, {})
+    return all(np.array_equal(made_with.get(name), value) for name, value in settings.get("made_with", {}).items())
 
 
 def _is_mujoco(layer: gym.Env) -> bool:

@@ -201,6 +201,7 @@ class SensorNoise(EntryWrapper):
         self._generator = np.random.default_rng()
         self._block = max(1, min(_NOISE_BLOCK, _NOISE_NUMBERS // max(1, self._entry.low.size)))
         self.noise_std = noise_std
+        self._settings_made_with = {"noise_std": self.noise_std}
         self._set_entry_space(noisy_box(self._entry, self.noise_std))
 
     @property

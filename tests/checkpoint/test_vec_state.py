@@ -1,9 +1,11 @@
 """The state of vectorised environments: taken once, put back, and not that of the environments that went on."""
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_gac.checkpoint.vec_env import restore_vec_env_state, vec_env_state
+from sb3_gac.envs import SensorNoise
 from tests.helpers import TwoViewBandit
 
 
@@ -32,3 +34,14 @@ def test_what_follows_is_what_followed():
             info.get("episode", {}).get("r") for info in expected[3]
         ]
     assert other.venv.episode_count == env.venv.episode_count
+
+
+class _Unknown(gym.Wrapper):
+    """A wrapper whose state nobody knows."""
+
+
+def test_settings_are_kept_where_episodes_cannot_be():
+    env, other = (DummyVecEnv([lambda: _Unknown(SensorNoise(TwoViewBandit(), 0.1))] * 2) for _ in range(2))
+    env.envs[1].env.noise_std = 0.3
+    assert "_Unknown" in restore_vec_env_state(other, vec_env_state(env))
+    assert [float(one.env.noise_std) for one in other.envs] == [np.float32(0.1), np.float32(0.3)]

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_gac.envs import History, PreviousAction, SensorNoise, SplitObservation
+from sb3_gac.envs import DroppedFrames, History, PreviousAction, SensorDelay, SensorNoise, SplitObservation
 from sb3_gac.envs.state import NotRestorableError, env_state, restore_env_state
 from tests.helpers import TwoViewBandit
 
@@ -75,6 +75,61 @@ def test_a_state_can_be_restored_again_and_again():
         restore_env_state(env, state)
         seen.append((_go_on(env, actions), list(env.episode_returns)))
     np.testing.assert_equal(seen[0], seen[1])
+
+
+def _disturbed(noise_std=0.1):
+    return SensorNoise(DroppedFrames(SensorDelay(MAKERS["pendulum"](), 1), 0.5), noise_std, key="privileged")
+
+
+def _settings(env):
+    return [float(env.noise_std), env.env.probability, env.env.env.steps, float(env.env.env.env.noise_std)]
+
+
+def _disturb_more(env):
+    env.noise_std, env.env.probability, env.env.env.steps, env.env.env.env.noise_std = 0.4, 0.25, 3, 0.2
+
+
+def test_settings_that_changed_during_training_are_restored():
+    env, other = _disturbed(), _disturbed()
+    actions = [np.array([0.1 * number], np.float32) for number in range(20)]
+    env.reset(seed=3)
+    _go_on(env, actions[:7])
+    _disturb_more(env)
+    _go_on(env, actions[7:10])
+    state = env_state(env)
+    expected = _go_on(env, actions)
+    other.reset(seed=4)
+    restore_env_state(other, state)
+    assert _settings(other) == pytest.approx([0.4, 0.25, 3, 0.2])
+    np.testing.assert_equal(_go_on(other, actions), expected)
+
+
+def test_an_environment_made_with_another_setting_keeps_it_from_the_first_step_on():
+    env, other = _disturbed(), _disturbed(noise_std=0.0)
+    env.reset(seed=3)
+    _disturb_more(env)
+    env.step(np.zeros(1, np.float32))  # draws noise for many steps
+    restore_env_state(other, env_state(env))
+    assert _settings(other) == pytest.approx([0.0, 0.25, 3, 0.2])
+    cosine, sine, _ = other.step(np.zeros(1, np.float32))[0]["privileged"]
+    assert np.hypot(cosine, sine) == pytest.approx(1)
+
+
+def test_a_state_of_an_earlier_version_leaves_settings_alone():
+    env = _disturbed()
+    env.reset(seed=3)
+    state = [{key: value for key, value in layer.items() if key != "settings"} for layer in env_state(env)]
+    _disturb_more(env)
+    restore_env_state(env, state)
+    assert _settings(env) == pytest.approx([0.4, 0.25, 3, 0.2])
+
+
+@pytest.mark.parametrize("probability", [-0.1, 1.1, True, "half"])
+def test_a_probability_is_checked_when_it_changes_too(probability):
+    env = DroppedFrames(MAKERS["pendulum"](), 0.5)
+    with pytest.raises(ValueError, match="probability must be a number from 0 to 1"):
+        env.probability = probability
+    assert env.probability == 0.5
 
 
 @pytest.mark.parametrize("name", MAKERS)

@@ -314,7 +314,19 @@ def test_a_state_can_be_restored_again_and_again():
     assert seen[0] == seen[1]
 
 
-def test_where_it_cannot_be_a_checkpoint_says_so(tmp_path):
-    _learned(Counters(3)).save_checkpoint(tmp_path)
+@pytest.mark.parametrize(("noise_std", "expected"), [(0.1, 0.5), (0.2, 0.2)])
+def test_a_setting_that_changed_is_restored_unless_the_environments_were_made_with_another(noise_std, expected):
+    env, other = RestorableCounters(3, time_limit=4, noise_std=0.1), RestorableCounters(3, time_limit=4, noise_std=noise_std)
+    env.reset()
+    env.set_attr("noise_std", 0.5)
+    other.restore_checkpoint_state(env.checkpoint_state())
+    assert other.noise_std == pytest.approx(expected)
+
+
+def test_where_it_cannot_be_a_checkpoint_says_so_and_keeps_the_settings(tmp_path):
+    model = _learned(Counters(3, noise_std=0.1))
+    model.env.set_attr("noise_std", 0.5)
+    model.save_checkpoint(tmp_path)
     with pytest.warns(UserWarning, match="new episodes.*Counters can't write down its simulator's state"):
-        GAC.resume(tmp_path, Counters(3))
+        resumed = GAC.resume(tmp_path, Counters(3, noise_std=0.1))
+    assert resumed.env.get_attr("noise_std")[0] == 0.5

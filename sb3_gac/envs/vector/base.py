@@ -17,7 +17,7 @@ from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
 from sb3_gac.envs.selections import BatchSelection, Indices, KeySelection
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
-from sb3_gac.envs.state import NotRestorableError
+from sb3_gac.envs.state import NotRestorableError, restore_settings, settings_of
 
 SimulatorObservation = np.ndarray | Mapping[str, np.ndarray]
 Observations = dict[str, np.ndarray]
@@ -82,6 +82,7 @@ class BatchVecEnv(VecEnv):
         self._partial = BatchSelection(PARTIAL, partial, observation_space)
         self._privileged = BatchSelection(PRIVILEGED, privileged, observation_space)
         self.time_limit, self.noise_std = time_limit, noise_std
+        self._settings_made_with = {"time_limit": self.time_limit, "noise_std": self.noise_std}
         noisy = noisy_box(self._partial.space, self.noise_std)
         space = spaces.Dict({PARTIAL: noisy, PRIVILEGED: self._privileged.space})
         super().__init__(n_envs, space, _in_float32(action_space))
@@ -302,6 +303,7 @@ class BatchVecEnv(VecEnv):
         """
         lengths = self._n_steps - self._begun
         own = {"lengths": lengths, "returns": self._returns, "noise": self._noise, "has_started": self._has_started}
+        own["settings"] = settings_of(self)
         return {"simulator": self.simulator_state(), **deepcopy(own)}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -313,6 +315,7 @@ class BatchVecEnv(VecEnv):
         """
         state = deepcopy(state)  # the next steps write into arrays and generators
         self.restore_simulator_state(state["simulator"])
+        restore_settings(self, state.get("settings", {}))  # files of earlier versions have none
         self._begin(np.arange(self.num_envs))
         self._begun -= state["lengths"]
         self._first_begun = int(self._begun.min())
