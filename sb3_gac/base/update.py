@@ -4,9 +4,9 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import partial, wraps
+from functools import partial
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -19,37 +19,6 @@ from sb3_gac.math.losses import critic_loss, masked_mean
 from sb3_gac.optim.coefficients import Coefficient
 from sb3_gac.optim.compile import Program
 from sb3_gac.optim.parallel import Worker, worker
-
-
-class _Step(NamedTuple):
-    """
-    A step of an optimiser that waits for :meth:`GradientSteps.joined`.
-
-    :param take: function that takes the step and returns its metrics
-    :param metrics: dict that gets the metrics once the step has been taken
-    """
-
-    take: Callable[[], Metrics]
-    metrics: Metrics
-
-
-def _scheduled(minimize: Callable[..., Metrics]) -> Callable[..., Metrics]:
-    """
-    Have the steps of ``minimize`` wait for :meth:`GradientSteps.joined`, where there is a worker.
-
-    :param minimize: the function :meth:`GradientSteps.minimize`
-    :return: function that takes the step at once without a worker, and otherwise returns a dict that gets the metrics later
-    """
-
-    @wraps(minimize)
-    def scheduled(self: Any, networks: str | tuple[str, ...], loss: Callable[..., Loss], *tensors: Any) -> Metrics:
-        if self._worker is None:
-            return minimize(self, networks, loss, *tensors)
-        step = _Step(partial(minimize, self, networks, loss, *tensors), Metrics())
-        self._branches[self._runs_beside(networks)].append(step)
-        return step.metrics
-
-    return scheduled
 
 
 class GradientSteps(BaseAlgorithm):
@@ -77,8 +46,6 @@ class GradientSteps(BaseAlgorithm):
     _branches_are_independent: bool
     #: Thread that takes the steps of :attr:`AsymmetricPolicy.side_branch`, in a round in which branches run at once
     _worker: Worker | None = None
-    #: Whether steps are the side branch's -> steps that wait for :meth:`joined`, during such a round
-    _branches: dict[bool, list[_Step]]
     _program_key: tuple[Any, ...] = ()
     #: Networks that the gradient step under way leaves as they are, see ``update_every``
     _resting: frozenset[str] = frozenset()
@@ -87,7 +54,6 @@ class GradientSteps(BaseAlgorithm):
 
     # --- what an algorithm's update is made of ------------------------------------------------------------------------
 
-    @_scheduled
     def minimize(self, networks: str | tuple[str, ...], loss: Callable[..., Loss], *tensors: Any) -> Metrics:
         """
         One step of a network's optimiser down a loss, for which all other networks are constants.
@@ -118,20 +84,21 @@ class GradientSteps(BaseAlgorithm):
             network.step(own[name], scale)
         return metrics | {f"{name}_grad_norm": norm for name, norm in norms.items()}
 
-    def joined(self, *steps: Metrics) -> Metrics:
+    def in_branches(self, beside: Callable[[], Metrics], here: Callable[[], Metrics]) -> Metrics:
         """
-        Finish steps that wait: a worker takes those of the side branch while this thread takes the others.
+        Take two chains of steps that share nothing but constants: at the same time if there is a worker, else in their order.
 
-        :param steps: dicts that :meth:`minimize` has returned
-        :return: metrics of all these steps, name -> metric, once all have been taken
+        :param beside: function that minimizes the losses of :attr:`AsymmetricPolicy.side_branch`, which a worker runs
+        :param here: function that minimizes the other losses
+        :return: metrics of both chains
         """
-        if self._worker is not None:
-            beside, here = self._branches[True], self._branches[False]
-            self._branches = {True: [], False: []}
-            self._worker.submit(partial(_take, beside))
-            _take(here)
-            self._worker.wait()
-        return {name: value for step in steps for name, value in step.items()}
+        if self._worker is None:
+            return beside() | here()
+        metrics = Metrics()
+        self._worker.submit(lambda: metrics.update(beside()))
+        own = here()
+        self._worker.wait()
+        return metrics | own
 
     def outputs(self, batch: Batch, *roles: str) -> list[Outputs]:
         """
@@ -148,13 +115,13 @@ class GradientSteps(BaseAlgorithm):
                 found[role] = batch.outputs(getattr(self.policy, role))
 
         for role in roles:
-            self._worker.submit(partial(run, role)) if self._runs_beside(role) else run(role)  # type: ignore[union-attr]
+            if self._worker is not None and role in self.policy.side_branch:
+                self._worker.submit(partial(run, role))
+            else:
+                run(role)
         if self._worker is not None:
             self._worker.wait()
         return [found[role] for role in roles]
-
-    def _runs_beside(self, networks: str | tuple[str, ...]) -> bool:
-        return self._worker is not None and networks in self.policy.side_branch
 
     def bellman_loss(self, name: str, batch: Batch, target: th.Tensor) -> Loss:
         r"""
@@ -190,14 +157,12 @@ class GradientSteps(BaseAlgorithm):
         settings = (getattr(self, name) for name in self.compiled_settings)
         self._program_key = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
         history: list[Metrics] = []
-        self._branches = {True: [], False: []}
         try:
             in_branches = self._branches_are_independent and not self.compiles and th.get_num_threads() > 1
             with worker(in_branches) as self._worker:
                 yield history
         finally:
             self._worker = None
-            del self._branches
         self._record_metrics(history)
 
     def _compiled(self, name: Any, function: Callable[..., Any], *args: Any) -> Any:
@@ -263,12 +228,6 @@ class GradientSteps(BaseAlgorithm):
         coefficients = {name: coefficient.value for name, coefficient in self.coefficients.items()}
         check_finite_metrics(self, values, self._last_metrics, coefficients)
         self._last_metrics = values
-
-
-def _take(steps: Sequence[_Step]) -> None:
-    """Take steps one after the other."""
-    for step in steps:
-        step.metrics.update(step.take())
 
 
 def _split(gradients: Sequence[th.Tensor], counts: Sequence[int]) -> Iterator[Sequence[th.Tensor]]:

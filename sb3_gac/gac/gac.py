@@ -224,11 +224,15 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
         alpha, beta = self.coefficients["kl_coef"].value, self.coefficients["ent_coef"].value
         noise = th.randn((4, *batch.actions.shape), device=self.device)
         pi = self.outputs(batch, "guider", "learner")
-        metrics = self.joined(
-            self.minimize("guider_critic", self.guider_critic_loss, batch, *pi, noise[0], alpha, beta),  # eq. 12
-            self.minimize("guider", self.guider_loss, batch, *pi, noise[1], alpha, beta),  # eq. 13
-            self.minimize("learner_critic", self.learner_critic_loss, batch, *pi, noise[2], beta),  # eq. 15
-            self.minimize("learner", self.learner_loss, batch, *pi, noise[3], alpha, beta),  # eq. 16
+        metrics = self.in_branches(
+            lambda: (
+                self.minimize("guider_critic", self.guider_critic_loss, batch, *pi, noise[0], alpha, beta)  # eq. 12
+                | self.minimize("guider", self.guider_loss, batch, *pi, noise[1], alpha, beta)  # eq. 13
+            ),
+            lambda: (
+                self.minimize("learner_critic", self.learner_critic_loss, batch, *pi, noise[2], beta)  # eq. 15
+                | self.minimize("learner", self.learner_loss, batch, *pi, noise[3], alpha, beta)  # eq. 16
+            ),
         )
         metrics |= self.coefficients["ent_coef"].update(float(self.target_entropy) - metrics["entropy"])
         metrics |= self.coefficients["kl_coef"].update(metrics["kl"] - self.target_kl_tensor)  # eq. 17

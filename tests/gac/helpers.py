@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from sb3_gac.base.batch import Batch, Loss
+from sb3_gac.base.batch import Batch, Loss, Metrics
 
 
 class Step(NamedTuple):
@@ -21,17 +21,22 @@ def steps_of(model: Any, batch: Batch) -> list[Step]:
     class StopHereError(Exception):
         """Instead of the steps."""
 
-    def stop(*steps: Any) -> Any:
+    def note(network: str, loss: Callable[..., Loss], *tensors: Any) -> Metrics:
+        found.append(Step(network, loss, tensors))
+        return {}
+
+    def stop(beside: Callable[[], Metrics], here: Callable[[], Metrics]) -> Metrics:
+        beside()
+        here()
         raise StopHereError
 
-    model.minimize = lambda network, loss, *tensors: found.append(Step(network, loss, tensors))
-    model.joined = stop
+    model.minimize, model.in_branches = note, stop
     try:
         model.update(batch)
     except StopHereError:
         pass
     finally:
-        del model.minimize, model.joined
+        del model.minimize, model.in_branches
     return [step for step in found if model.policy.has(step.network)]
 
 
