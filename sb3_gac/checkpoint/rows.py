@@ -19,6 +19,10 @@ class Ring(Protocol):
         """Number of rows added so far."""
 
     @property
+    def filling(self) -> object:
+        """An object that is another one once rows have changed in another way than by adding further ones."""
+
+    @property
     def n_rows(self) -> int:
         """Number of rows that the buffer holds when it is full."""
 
@@ -31,11 +35,13 @@ class SavedBlocks(NamedTuple):
     The blocks of a buffer's rows that were written last.
 
     :param root: folder of all checkpoints of a run
+    :param filling: the buffer's :attr:`Ring.filling` by then
     :param n_added: number of rows that had been added to the buffer by then
     :param names: names of the blocks, in the order of the rows
     """
 
     root: Path
+    filling: object
     n_added: int
     names: list[str]
 
@@ -55,7 +61,8 @@ def write_rows(buffer: Ring, root: Path, before: SavedBlocks | None) -> SavedBlo
     n_filled = min(buffer.n_added + 1, n_rows)
     names = [""] * -(-n_filled // per_block)
     changed = np.arange(len(names))
-    if before is not None and before.root == root and buffer.n_added - before.n_added < n_rows - 2:
+    is_known = before is not None and before.root == root and before.filling is buffer.filling
+    if before is not None and is_known and buffer.n_added - before.n_added < n_rows - 2:
         names[: len(before.names)] = before.names
         # The step before may have been cut, and the newest next observation is in the row of the next step
         written = np.arange(max(before.n_added - 1, 0), buffer.n_added + 1) % n_rows // per_block
@@ -63,7 +70,7 @@ def write_rows(buffer: Ring, root: Path, before: SavedBlocks | None) -> SavedBlo
     for block in changed.astype(int).tolist():
         rows = slice(block * per_block, min((block + 1) * per_block, n_filled))
         names[block] = write_block(root, b"".join(array[rows].tobytes() for array in arrays.values()))
-    return SavedBlocks(root, buffer.n_added, names)
+    return SavedBlocks(root, buffer.filling, buffer.n_added, names)
 
 
 def read_rows(buffer: Ring, root: Path, names: list[str]) -> SavedBlocks:
@@ -84,7 +91,7 @@ def read_rows(buffer: Ring, root: Path, names: list[str]) -> SavedBlocks:
             part = array[rows]
             part[...] = np.frombuffer(content[start : start + part.nbytes], dtype=array.dtype).reshape(part.shape)
             start += part.nbytes
-    return SavedBlocks(root, buffer.n_added, names)
+    return SavedBlocks(root, buffer.filling, buffer.n_added, names)
 
 
 def _rows_per_block(arrays: Mapping[str, np.ndarray]) -> int:

@@ -47,6 +47,8 @@ class CompactDictReplayBuffer(ShownByStep):
     :raises MemoryError: if the buffer does not fit into the available memory
     """
 
+    #: See :class:`sb3_gac.checkpoint.rows.Ring`
+    filling: object
     #: Number of steps, counted from the first step ever added, that are no longer sampled
     _n_retired = 0
     mask_truncations = False
@@ -88,6 +90,7 @@ class CompactDictReplayBuffer(ShownByStep):
         self.rewards = np.zeros((self.n_rows, n_envs), dtype=np.float32)
         self.endings = np.zeros((self.n_rows, n_envs), dtype=np.uint8)
         self._n_added = 0
+        self.mark_changed()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a pickled buffer; buffers of earlier versions have no ring, and hold the rows themselves."""
@@ -96,6 +99,7 @@ class CompactDictReplayBuffer(ShownByStep):
         if rows is not None:
             self._ring = ObservationRing(self.layout, self.n_rows, self.n_envs)
             self._ring.rows = rows
+        self.mark_changed()
 
     # --- sizes ------------------------------------------------------------------------------------------------------
 
@@ -119,6 +123,7 @@ class CompactDictReplayBuffer(ShownByStep):
         self._finals = FinalObservations(self.layout)
         self._ring.reset()
         self.endings[:] = 0
+        self.mark_changed()
 
     # --- checkpoints -------------------------------------------------------------------------------------------------
 
@@ -151,6 +156,11 @@ class CompactDictReplayBuffer(ShownByStep):
         self.full = self._n_added >= self.buffer_size
         self._finals.restore(state["finals"])
         self._ring.restore(state.get("frames", {}))
+        self.mark_changed()
+
+    def mark_changed(self) -> None:
+        """Have the next checkpoint write all rows; needed after rows were changed in place, such as rewards computed anew."""
+        self.filling = object()
 
     # --- adding ------------------------------------------------------------------------------------------------------
 

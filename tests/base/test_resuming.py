@@ -279,6 +279,39 @@ def test_each_checkpoint_has_every_row_that_changed_since_the_one_before(rows_pe
     assert (model.replay_buffer.endings == CUT).any() == (buffer_size == 1_000)
 
 
+def _empty(model, path):
+    model.replay_buffer.reset()
+
+
+def _load_another(model, path):
+    small_model(_bandits(), buffer_size=1_000, seed=9).learn(15).save_replay_buffer(path / "buffer")
+    model.load_replay_buffer(path / "buffer")
+
+
+def _relabel(model, path):
+    model.replay_buffer.rewards[:] += 1
+    model.replay_buffer.mark_changed()
+
+
+@pytest.mark.parametrize("change", [_empty, _load_another, _relabel])
+@pytest.mark.parametrize("further_steps", [2, 30, 60])
+def test_a_checkpoint_has_the_rows_of_the_present_buffer(change, further_steps, tmp_path, monkeypatch):
+    """The buffer then holds fewer rows than at the checkpoint before, as many, or more."""
+    model = small_model(_bandits(), buffer_size=1_000, learning_starts=1_000)
+    row_bytes = sum(rows[0].nbytes for rows in model.replay_buffer.rows_by_name().values())
+    monkeypatch.setattr("sb3_gac.checkpoint.rows.BLOCK_BYTES", 4 * row_bytes)
+    model.learn(30)
+    model.save_checkpoint(tmp_path)
+    change(model, tmp_path)
+    for _ in range(2):
+        model.learn(further_steps, reset_num_timesteps=False)
+        model.save_checkpoint(tmp_path)
+        resumed = GAC.resume(tmp_path, _bandits(), device="cpu").replay_buffer
+        assert resumed.n_added == model.replay_buffer.n_added
+        for name, rows in model.replay_buffer.rows_by_name().items():
+            np.testing.assert_array_equal(resumed.rows_by_name()[name][: resumed.n_added], rows[: resumed.n_added])
+
+
 def test_notes_come_back(tmp_path):
     model = small_model().learn(20)
     model.save_checkpoint(tmp_path, notes={"evaluations": [1.5, None]})
