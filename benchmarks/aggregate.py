@@ -274,9 +274,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: command-line arguments, by default those of the process
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("suite", type=Path)
-    parser.add_argument("--runs", type=Path, default=RUNS)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.aggregate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("suite", type=Path, help="YAML file of the suite")
+    parser.add_argument("--runs", type=Path, default=RUNS, help="directory of all runs (default: benchmarks/runs)")
     parser.add_argument("--out", type=Path, required=True, help="path of the results, without a suffix")
     parser.add_argument("--reference", help=f"to whose final return steps are counted: {REFERENCE}, or the first, by default")
     parser.add_argument("--complete-cells", action="store_true", help="leave out cells of which a run is missing")

@@ -205,13 +205,17 @@ def _at_least(least: int) -> Callable[[str], int]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("suite", type=Path)
-    parser.add_argument("--engine", choices=["local", "ray"], default="local")
-    parser.add_argument("--address", default="auto", help="of the Ray cluster")
-    parser.add_argument("--jobs", type=_at_least(1), help="runs side by side; default: one on each CPU")
-    parser.add_argument("--retries", type=_at_least(0), default=1, help="further attempts after a run that failed; default: 1")
-    parser.add_argument("--runs", type=Path, default=RUNS, help="directory of all runs")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.launch", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("suite", type=Path, help="YAML file of the suite, such as benchmarks/suites/halfcheetah.yml")
+    parser.add_argument("--engine", choices=["local", "ray"], default="local", help="what makes the runs (default: local)")
+    parser.add_argument("--address", default="auto", help="of the Ray cluster, with --engine ray (default: auto)")
+    parser.add_argument("--jobs", type=_at_least(1), help="runs side by side (default: one on each CPU)")
+    parser.add_argument(
+        "--retries", type=_at_least(0), default=1, help="further attempts after a run that failed (default: 1)"
+    )
+    parser.add_argument("--runs", type=Path, default=RUNS, help="directory of all runs (default: benchmarks/runs)")
     add_reuse_options(parser)
     parser.add_argument(
         "--dry-run", action="store_true", help="print the commands of what is left to do, and how many there are"

@@ -233,10 +233,12 @@ def write_evaluations(history: list[dict[str, float]], path: Path) -> None:
 
 def main() -> None:
     """Entry point of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--suite", type=Path, required=True)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.run", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--suite", type=Path, required=True, help="YAML file of the suite")
     parser.add_argument("--index", type=int, required=True, help="which run of the suite, see launch --dry-run")
-    parser.add_argument("--runs", type=Path, default=RUNS)
+    parser.add_argument("--runs", type=Path, default=RUNS, help="directory of all runs (default: benchmarks/runs)")
     parser.add_argument(
         "--needed",
         nargs="+",

@@ -22,8 +22,15 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("matching", nargs="?", default="", help="only ids that contain this, in small or capital letters")
     parser.add_argument("--speed", action="store_true", help="measure those that are installed")
-    parser.add_argument("--envs", type=int, nargs="+", default=[1, 16], metavar="N", help="side by side, with --speed")
-    parser.add_argument("--seconds", type=float, default=1.0, help="of each measurement")
+    parser.add_argument(
+        "--envs",
+        type=int,
+        nargs="+",
+        default=[1, 16],
+        metavar="N",
+        help="environments side by side, with --speed (default: 1 16)",
+    )
+    parser.add_argument("--seconds", type=float, default=1.0, help="duration of each measurement, with --speed (default: 1)")
     options = parser.parse_args(arguments)
     if min(options.envs) < 1:
         parser.error(f"--envs: must be integers of at least 1, got {min(options.envs)}.")

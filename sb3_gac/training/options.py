@@ -61,12 +61,16 @@ def make_parser(description: str | None = None) -> argparse.ArgumentParser:
 def _add_environment(group: Any) -> None:
     tasks = sorted(task_of(env_id) for suite in SUITES.values() if suite.sensor_noise for env_id in suite.environments)
     group.add_argument(
-        "--task", choices=tasks, metavar="TASK", help=f"one of {', '.join(tasks)} (default: {DEFAULTS['task']})"
+        "--task",
+        choices=tasks,
+        metavar="TASK",
+        help=f"registered task that takes --noise, one of {', '.join(tasks)}; other registered tasks go by --env, and "
+        f"sb3-gac envs lists them (default: {DEFAULTS['task']})",
     )
     group.add_argument(
         "--env",
-        help="another environment, with Dict(partial, privileged) observations: an id of gymnasium's, my_module:MyEnv-v0, "
-        "whose module registers it, or my_module:make_env, a class or function that makes one",
+        help="another environment, with Dict(partial, privileged) observations: a registered id; my_module:MyEnv-v0, whose "
+        "module registers it; or my_module:make_env, a class or function that makes one",
     )
     group.add_argument(
         "--env-kwargs", type=mapping, metavar="YAML", help='its arguments, such as "{mass: 2.0}" (default: none)'
@@ -75,13 +79,14 @@ def _add_environment(group: Any) -> None:
         "--whole-state",
         action="store_true",
         default=None,
-        help="the privileged entry of --env has all that partial shows: critics then see it alone, and no sensor noise "
-        "(default: they see both; tasks say it themselves)",
+        help="for an --env of your own: privileged has all that partial shows, without noise, so critics read privileged "
+        "alone (default: critics read both entries). Registered tasks do not take it, since this is known of them",
     )
     group.add_argument(
         "--noise",
         type=float,
-        help="standard deviation of a task's sensor noise (default: 0.1, or 0 where sensors have their own)",
+        help="standard deviation of a task's sensor noise, in the units of partial (default: 0.1, or 0 where sensors have "
+        "their own)",
     )
     group.add_argument(
         "--privileged",
@@ -106,8 +111,10 @@ def _add_training(group: Any) -> None:
     group.add_argument(
         "--teacher", type=Path, metavar="MODEL", help="model.zip of another run, for algorithms that have a teacher"
     )
-    group.add_argument("--steps", type=positive, help=f"of all environments together (default: {DEFAULTS['steps']})")
-    group.add_argument("--seed", type=int, help=f"of everything random (default: {DEFAULTS['seed']})")
+    group.add_argument(
+        "--steps", type=positive, help=f"environment steps, of all environments together (default: {DEFAULTS['steps']})"
+    )
+    group.add_argument("--seed", type=int, help=f"seed of everything random (default: {DEFAULTS['seed']})")
     group.add_argument("--envs", type=positive, help="environments side by side (default: as many as the preset is for)")
     group.add_argument(
         "--preset",
@@ -115,7 +122,10 @@ def _add_training(group: Any) -> None:
         help="arguments of the algorithm (default: those for the task's suite, or small)",
     )
     group.add_argument(
-        "--overrides", type=mapping, metavar="YAML", help='of the preset, such as "{gamma: 0.95}" (default: none)'
+        "--overrides",
+        type=mapping,
+        metavar="YAML",
+        help='changes to the preset, such as "{gamma: 0.95, learning_rate: 1.0e-3}"; YAML reads 1e-3 as text (default: none)',
     )
     group.add_argument(
         "--compile",
