@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_gac.base.acting import BehaviourState
 from sb3_gac.base.arguments import ConstructorArguments, present_names
+from sb3_gac.base.changing import ChangingArguments, arguments_of
 from sb3_gac.base.compiling import AUTO, Compilation
 from sb3_gac.base.faults import FaultTolerance
 from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
@@ -25,7 +26,6 @@ from sb3_gac.base.strict_predict import DeploymentGuard
 from sb3_gac.base.update import GradientSteps
 from sb3_gac.checks.arguments import (
     COMMON_CHECKS,
-    KEPT_AS,
     ArgumentCheck,
     PlainSchedule,
     check_arguments,
@@ -35,13 +35,20 @@ from sb3_gac.checks.requirements import warn_of_an_unseen_goal
 from sb3_gac.checks.scale import check_same_scale
 from sb3_gac.checks.values import plain
 from sb3_gac.networks.heads import check_action_space
-from sb3_gac.optim.coefficients import Coefficient, DualVariable, LearnedCoefficient
+from sb3_gac.optim.coefficients import Coefficient, DualVariable
 from sb3_gac.optim.parallel import has_side_effects
 from sb3_gac.replay.source import ReplaySource
 
 
 class AsymmetricAlgorithm(
-    ConstructorArguments, DeploymentGuard, ResumableAlgorithm, FaultTolerance, EpisodeHooks, GradientSteps, Compilation
+    ConstructorArguments,
+    ChangingArguments,
+    DeploymentGuard,
+    ResumableAlgorithm,
+    FaultTolerance,
+    EpisodeHooks,
+    GradientSteps,
+    Compilation,
 ):
     """
     Base of all algorithms, beside SB3's ``OffPolicyAlgorithm`` or ``OnPolicyAlgorithm``.
@@ -55,6 +62,9 @@ class AsymmetricAlgorithm(
     argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = COMMON_CHECKS
     #: Arguments whose results are in files: ``load`` and ``resume`` apply them after those results have been restored
     restored_arguments: ClassVar[tuple[str, ...]] = ("lr_scales", "stats_window_size")
+    built_in_arguments = (*ResumableAlgorithm.fixed_arguments, "seed")
+    #: Arguments that the policy class alone reads, so that ``policy_kwargs`` may have them too
+    policy_arguments: ClassVar[tuple[str, ...]] = ("role_keys", "lr_scales")
     #: Arguments that are trained models or their paths, whose policies training asks for actions, see :attr:`frozen`
     frozen_arguments: ClassVar[tuple[str, ...]] = ()
     #: Name of such an argument -> its policy, from the first ``learn`` on
@@ -97,6 +107,7 @@ class AsymmetricAlgorithm(
         self._branches_are_independent = self.device.type == "cpu" and bool(self.policy.side_branch) and not side_effects
         if self.compile not in (False, AUTO):
             self.check_can_compile()
+        self.make_schedules()
         self.coefficients = self.make_coefficients()
         self._keep_coefficients()
         self.programs = {}
@@ -104,6 +115,7 @@ class AsymmetricAlgorithm(
         self.frozen = {}
         if self.env is not None:  # a model without environments only acts, which takes no teacher
             self._load_frozen(needed=False)
+        self._in_force = arguments_of(self)
 
     def _prepare_data(self) -> dict[str, Any]:
         """
@@ -142,11 +154,17 @@ class AsymmetricAlgorithm(
             raise ValueError(f'lr_scales names "{MEMORY}", but no network has one: leave it out, or choose an rnn_type.')
 
     def _all_policy_kwargs(self) -> dict[str, Any]:
-        return {**self._policy_options(), **present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")}
+        own, given = self._policy_options(), present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")
+        for name in own.keys() & given.keys() - set(self.policy_arguments):
+            raise ValueError(f"policy_kwargs has {name}, which is an argument of {type(self).__name__}: pass it as that.")
+        return {**own, **given}
 
     def _policy_options(self) -> dict[str, Any]:
         """The algorithm's own arguments that it hands to the policy class."""
         return {"role_keys": self.role_keys, "lr_scales": self.lr_scales}
+
+    def make_schedules(self) -> None:
+        """Make the schedules of arguments that may be schedules, besides the learning rate's."""
 
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The algorithm's coefficients: name -> coefficient, whose value multiplies a term of a loss."""
@@ -206,6 +224,8 @@ class AsymmetricAlgorithm(
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         result = super()._setup_learn(*args, **kwargs)
+        # SB3 leaves the end of the last training here until the first step, but the first policies to act are chosen before
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         self._load_frozen(needed=True)
         self.decide_compilation()
         return result
@@ -265,33 +285,24 @@ class AsymmetricAlgorithm(
                 parameters[name] = network.in_present_layout(parameters[name])
         super().set_parameters(parameters, exact_match, device)
 
-    def _change_arguments(self, given: dict[str, Any]) -> None:
-        """
-        Put arguments in the place of restored ones.
+    # --- changes of arguments ---------------------------------------------------------------------------------------
 
-        A coefficient that is learned before and after goes on from its restored value, unless it is given a start value.
-
-        :param given: name -> value of some of ``restored_arguments``
-        """
-        if not given:
-            return
-        before = {name: (getattr(self, name, None), coefficient) for name, coefficient in self.coefficients.items()}
-        vars(self).update({KEPT_AS.get(name, name): value for name, value in given.items()})
-        make_arguments_plain(self)
-        self._check_arguments()
-        self.coefficients = self.make_coefficients()
-        for name, (spec, coefficient) in before.items():
-            spec_now = getattr(self, name, None)
-            if not any(other.startswith(name) for other in given):
-                self.coefficients[name] = coefficient
-            elif spec_now == spec or (spec_now == "auto" and isinstance(coefficient, LearnedCoefficient)):
-                self.coefficients[name].go_on_from(coefficient)
-        self._keep_coefficients()
-        if "lr_scales" in given:
+    def take_effect(self, changed: set[str]) -> None:
+        """See :meth:`ChangingArguments.take_effect`."""
+        self.make_schedules()
+        if "learning_rate" in changed:
+            self._setup_lr_schedule()
+        if "lr_scales" in changed:
             self.policy.scale_learning_rates(self._all_policy_kwargs()["lr_scales"])
-        for buffer in ("ep_info_buffer", "ep_success_buffer"):
-            if getattr(self, buffer) is not None:
-                setattr(self, buffer, deque(getattr(self, buffer), maxlen=self._stats_window_size))
+        if "stats_window_size" in changed:
+            for buffer in ("ep_info_buffer", "ep_success_buffer"):
+                if getattr(self, buffer) is not None:
+                    setattr(self, buffer, deque(getattr(self, buffer), maxlen=self._stats_window_size))
+        replaced = changed.intersection(self.frozen_arguments)
+        for name in replaced:
+            self.frozen.pop(name, None)
+        if replaced:
+            self._load_frozen(needed=True)
 
     def _excluded_save_params(self) -> list[str]:
         coefficients = [f"{name}_dual" for name in self.coefficients]

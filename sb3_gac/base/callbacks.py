@@ -177,17 +177,18 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
             "kl": (
                 kl > 2 * target_kl,
                 f"KL(guider || learner) is {kl:.2g} for a target of {target_kl:.2g}: the learner does not keep up. "
-                'Use guider="residual", set a hard bound with max_kl, or raise target_kl.',
+                'Use guider="residual", set a hard bound by max_kl, widen kl_coef_bounds, or raise kl_coef_learning_rate.',
             ),
             "bound": (
                 self._watched.get("train/kl_coef_on_bound", 0.0) > 0.5,
-                f"kl_coef sits on a bound ({kl_coef:.2g}): it can no longer steer KL, which is {kl:.2g} for a target of "
-                f"{target_kl:.2g}. Widen kl_coef_bounds, or choose another target_kl.",
+                f"kl_coef sits on a bound ({kl_coef:.2g}), and KL is {kl:.2g} for a target of {target_kl:.2g}. "
+                + ("Widen kl_coef_bounds." if kl > target_kl else "The guider wants nothing that the learner does not do."),
             ),
             "gap": (
                 gap > self.gap_tolerance * abs(guider_returns.mean()) + 2 * noise,
                 f"the guider returns {guider_returns.mean():.5g} and the learner {learner_returns.mean():.5g}: the learner "
-                "can't do what the guider does. Lower target_kl, or let the learner see more (for example a history).",
+                "can't do what the guider does. Lower target_kl, give the learner more of the episodes by behaviour, pull it "
+                "by guidance, or let it see more (a history, a memory).",
             ),
         }
         for name, (is_so, message) in found.items():

@@ -1,5 +1,6 @@
 """The loop that collects data: it stores each step that was taken, and no other, whoever stops or interrupts it."""
 
+import inspect
 import warnings
 from collections.abc import Callable
 from copy import deepcopy
@@ -55,6 +56,7 @@ class DataCollection(OffPolicyAlgorithm):
     check_samples_from: Callable[[type[ReplayBuffer] | None], None]
     note_use: Callable[[], None]
     call_hooks: Callable[[np.ndarray], None]
+    follow_arguments: Callable[[], None]
     reset_if_used_elsewhere: Callable[[VecEnv], None]
 
     @property
@@ -149,10 +151,14 @@ class DataCollection(OffPolicyAlgorithm):
         if self.env is not None:
             _check_number(loaded, self.n_envs)
         self.replay_buffer = loaded
-        if isinstance(loaded, CompactDictReplayBuffer):
+        self._set_sampling_options(loaded)
+
+    def _set_sampling_options(self, buffer: ReplayBuffer) -> None:
+        """Have the model's arguments say how one of this package's buffers is sampled."""
+        if isinstance(buffer, CompactDictReplayBuffer):
             options = self._replay_buffer_options()
-            given = {name: options[name] for name in SAMPLING_OPTIONS if name in options and hasattr(loaded, name)}
-            vars(loaded).update(given)
+            defaults = {name: _default(type(buffer), name) for name in SAMPLING_OPTIONS if hasattr(buffer, name)}
+            vars(buffer).update({name: options.get(name, default) for name, default in defaults.items()})
 
     # --- checkpoints ------------------------------------------------------------------------------------------------
 
@@ -232,6 +238,9 @@ class DataCollection(OffPolicyAlgorithm):
         log_interval: int | None = None,
     ) -> RolloutReturn:
         """See SB3's ``collect_rollouts``; callbacks find the same names in ``locals``."""
+        self.follow_arguments()
+        if not isinstance(train_freq, TrainFreq):  # somebody has set a number
+            train_freq = self.train_freq
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
         continue_training = True
@@ -304,6 +313,13 @@ class DataCollection(OffPolicyAlgorithm):
         of_the_data = ["_rollout_steps", "_rollout_episodes"]  # of the rollout under way, which a model's file does not hold
         of_files = ["_saved_blocks", "_resumed_noise"]
         return [*super()._excluded_save_params(), "_replay_source", *of_the_data, *of_files]
+
+
+def _default(buffer_class: type, option: str) -> Any:
+    """Default of an option of a class of replay buffers, or of the ancestor to which its constructor hands the option on."""
+    constructors = (vars(ancestor)["__init__"] for ancestor in buffer_class.__mro__ if "__init__" in vars(ancestor))
+    parameters = (inspect.signature(constructor).parameters for constructor in constructors)
+    return next(named[option].default for named in parameters if option in named)
 
 
 def _check_number(buffer: Any, n_envs: int, remedy: str = "load the model with as many environments") -> None:

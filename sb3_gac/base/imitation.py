@@ -13,6 +13,7 @@ Behaviour cloning (Pomerleau 1991) and DAgger (Ross et al. 2011, arXiv 1011.0686
 """
 
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -115,10 +116,11 @@ def clone_behaviour(
 
     Where actions are continuous, the loss is the squared error of the policy's most likely action; where they are discrete,
     it is their negative log-likelihood. A Gaussian's standard deviation, the critics and the guider stay as they are, so a
-    residual guider starts at the cloned policy. A tenth of the demonstrations is held out to measure the result.
+    residual guider starts at the cloned policy; the policy's target network, if it has one, is the cloned policy too. A tenth
+    of the demonstrations is held out to measure the result.
 
     Critics know nothing of the cloned policy at first, and the policy's first gradient steps in ``learn`` may unlearn what
-    was cloned. ``learning_starts`` and, where it can be set, ``policy_delay`` give the critics time.
+    was cloned. ``policy_delay``, where it can be set, gives the critics time.
 
     :param model: model of this package, whose deployed policy has no memory
     :param demonstrations: demonstrations to learn from, see :func:`demonstrate`
@@ -155,6 +157,7 @@ def clone_behaviour(
         optimizer.step()
     policy.deployed.train(False)
     optimizer.zero_grad()
+    _reset_targets(policy, policy.deployed)
     return {"before": before, "after": _error(policy, observations, actions, test)}
 
 
@@ -180,10 +183,20 @@ def copy_networks(model: BaseAlgorithm, source: BaseAlgorithm, networks: Mapping
             )
     for name, from_name in networks.items():
         parameters = _network(source, from_name).state_dict()
-        _network(model, name).load_state_dict(parameters)
-        target = getattr(model.policy, f"{name}_target", None)
-        if target is not None:
-            target.load_state_dict(parameters)
+        network = _network(model, name)
+        network.load_state_dict(parameters)
+        _reset_targets(model.policy, network)  # type: ignore[arg-type]
+
+
+@th.no_grad()
+def _reset_targets(policy: AsymmetricPolicy, changed: nn.Module) -> None:
+    """Put a changed network's parameters into its target, and those of an encoder that it shares into the others' targets."""
+    own = {id(tensor) for tensor in chain(changed.parameters(), changed.buffers())}
+    for network, target in policy.pairs.values():
+        followed, following = (chain(one.parameters(), one.buffers()) for one in (network, target))
+        for now, before in zip(followed, following, strict=True):
+            if id(now) in own:
+                before.copy_(now)
 
 
 def _network(model: BaseAlgorithm, name: str) -> nn.Module:

@@ -106,6 +106,13 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
     compiled_settings = (*AsymmetricAlgorithm.compiled_settings, "tau")
     restored_arguments = (*AsymmetricAlgorithm.restored_arguments, "ent_coef")
     fixed_arguments = (*AsymmetricAlgorithm.fixed_arguments, "buffer_size", "replay_buffer_class")
+    built_in_arguments = (
+        *AsymmetricAlgorithm.built_in_arguments,
+        "buffer_size",
+        "replay_buffer_class",
+        "replay_buffer_kwargs",
+        "optimize_memory_usage",
+    )
     progress = (*AsymmetricAlgorithm.progress, *DataCollection.collected)
     _waiting = False
     _shifted_entries: tuple[str, ...] = ()
@@ -174,6 +181,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
             raise ValueError("action_noise can be added to Box actions only: leave it out.")
         assert isinstance(self.observation_space, spaces.Dict)
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
+        self._check_replay_buffer_kwargs()
         check_goals(self.replay_buffer_class, self.observation_space, self.env)
         resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
         roles = self.policy_class.roles
@@ -185,6 +193,15 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         self._make_behaviour()
         self.check_samples_from(self.replay_buffer_class)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
+
+    def _check_replay_buffer_kwargs(self) -> None:
+        for name in ("n_steps", "gamma"):
+            value, own = self.replay_buffer_kwargs.get(name), getattr(self, name)
+            if value is not None and value != own:
+                raise ValueError(
+                    f"replay_buffer_kwargs has {name}={value}, but {type(self).__name__} has {name}={own}, which the replay "
+                    f"buffer follows: leave {name} out of replay_buffer_kwargs."
+                )
 
     def check_samples_from(self, replay_buffer_class: type[ReplayBuffer] | None) -> None:
         """
@@ -205,6 +222,15 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
             for option in ("storage_dtype", "frame_stacks"):
                 now, then = ((arguments["replay_buffer_kwargs"] or {}).get(option) for arguments in (given, before))
                 check_unchanged(f"replay_buffer_kwargs' {option}", now, then, "resume()")
+
+    def take_effect(self, changed: set[str]) -> None:
+        """See :meth:`AsymmetricAlgorithm.take_effect`; here are behaviour, train_freq and the replay buffer's."""
+        super().take_effect(changed)
+        self.chooses_behaviour = self._make_behaviour()
+        if "train_freq" in changed:
+            self._convert_train_freq()
+        if self.replay_buffer is not None:
+            self._set_sampling_options(self.replay_buffer)
 
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The algorithm's coefficients by name: in most algorithms the entropy temperature alone."""
@@ -274,6 +300,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         progress_bar: bool = False,
     ) -> Self:
         """See SB3's ``OffPolicyAlgorithm.learn``; by default TensorBoard's runs have the name of the class."""
+        self.follow_arguments()  # SB3 looks at train_freq first
         tb_log_name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
@@ -305,6 +332,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         :param gradient_steps: number of gradient steps
         :param batch_size: number of transitions per gradient step, B
         """
+        self.follow_arguments()
         if self._waits_for_an_episode():
             return
         update_every = resolve_update_every(self.policy.roles, self.policy_delay, self.update_every)

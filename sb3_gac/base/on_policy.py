@@ -74,6 +74,7 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
         "unroll_length": unless(None, check_integer, low=1, remedy="or None for the whole rollout"),
     }
     fixed_arguments = (*AsymmetricAlgorithm.fixed_arguments, "n_steps")
+    built_in_arguments = (*AsymmetricAlgorithm.built_in_arguments, "n_steps")
     progress = (*AsymmetricAlgorithm.progress, *RolloutCollection.collected)
     compiled_settings = (*AsymmetricAlgorithm.compiled_settings, "ent_coef", "vf_coef", "normalize_advantage")
 
@@ -105,8 +106,17 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.clip_range_schedule = PlainSchedule(self.clip_range)
         self.clip_range_tensor = th.zeros((), device=self.device)
+
+    def make_schedules(self) -> None:
+        """See :meth:`AsymmetricAlgorithm.make_schedules`; here is that of the clip range."""
+        super().make_schedules()
+        self.clip_range_schedule = PlainSchedule(self.clip_range)
+
+    def take_effect(self, changed: set[str]) -> None:
+        """See :meth:`AsymmetricAlgorithm.take_effect`; the rollout buffer computes with arguments of its own."""
+        super().take_effect(changed)
+        vars(self.rollout_buffer).update({name: getattr(self, name) for name in ("gamma", "gae_lambda", "unroll_length")})
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -145,6 +155,7 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
 
     def train(self) -> None:
         """A round of gradient steps on the rollout that was just collected."""
+        self.follow_arguments()
         with self.gradient_steps_under_way() as history:
             for batch in self._minibatches():
                 history.append(self._compiled("update", self.update, batch) if self.compiles else self.update(batch))

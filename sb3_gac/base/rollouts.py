@@ -70,6 +70,7 @@ class RolloutCollection(OnPolicyAlgorithm):
     reset_if_used_elsewhere: Callable[[VecEnv], None]
     check_minibatches: Callable[[int], None]
     call_hooks: Callable[[np.ndarray], None]
+    follow_arguments: Callable[[], None]
 
     def _setup_model(self) -> None:
         """See SB3's ``_setup_model``; the policy is made without SB3's argument ``use_sde``."""
@@ -161,6 +162,7 @@ class RolloutCollection(OnPolicyAlgorithm):
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
         """See SB3's ``collect_rollouts``; callbacks find the same names in ``locals``."""
+        self.follow_arguments()
         self.policy.set_training_mode(False)
         if self.rollout_buffer.generator_ready:  # gradient steps have been taken on the rollout
             self.rollout_buffer.reset()

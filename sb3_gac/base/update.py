@@ -1,5 +1,6 @@
 """The parts of a gradient step: the primitive ``minimize``, compiled programs, and the logging of metrics."""
 
+import warnings
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,6 +20,9 @@ from sb3_gac.math.losses import critic_loss, masked_mean
 from sb3_gac.optim.coefficients import Coefficient
 from sb3_gac.optim.compile import Program
 from sb3_gac.optim.parallel import Worker, worker
+
+#: Number of programs of one function, for different settings, after which a warning is given
+MANY_PROGRAMS = 3
 
 
 class GradientSteps(BaseAlgorithm):
@@ -165,7 +169,7 @@ class GradientSteps(BaseAlgorithm):
             self._worker = None
         self._record_metrics(history)
 
-    def _compiled(self, name: Any, function: Callable[..., Any], *args: Any) -> Any:
+    def _compiled(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
         """
         Call a function by its compiled program, of which there is one for each combination of all that it depends on.
 
@@ -176,9 +180,25 @@ class GradientSteps(BaseAlgorithm):
         """
         key = (name, self._resting, *self._program_key, *_layout(args))
         if key not in self.programs:
+            self._warn_of_many_programs(name)
             when_it_fails = self._compiling_failed if self.compile == AUTO else None
             self.programs[key] = Program(function, self.device, when_it_fails)
         return self.programs[key](*args)
+
+    def _warn_of_many_programs(self, name: str) -> None:
+        """
+        Warn when a setting that is a constant of programs keeps changing.
+
+        :param name: name of the function that is about to be compiled once more
+        """
+        settings = {key[2 : 2 + len(self._program_key)] for key in self.programs if key[0] == name}
+        if len(settings) == MANY_PROGRAMS and self._program_key not in settings:
+            warnings.warn(
+                f"Gradient steps are compiled for the {MANY_PROGRAMS + 1}th time, since the number of threads has changed, or "
+                f"one of {', '.join(self.compiled_settings)}. Each new value takes half a minute: keep to a few values, or "
+                "set compile=False.",
+                stacklevel=2,
+            )
 
     def _precision(self) -> AbstractContextManager:
         if self.mixed_precision:

@@ -259,6 +259,11 @@ class GPOPenalty(GPO):
         kl_coef = MultiplicativeCoefficient(FIRST_KL_COEF, KL_COEF_FACTOR, self.largest_kl_coef, self.device)
         return {"kl_coef": kl_coef}
 
+    def take_effect(self, changed: set[str]) -> None:
+        """See :meth:`AsymmetricAlgorithm.take_effect`; here is the largest weight of the KL."""
+        super().take_effect(changed)
+        self.coefficients["kl_coef"].largest = self.largest_kl_coef  # type: ignore[union-attr]
+
     def guider_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor, weights: Weights) -> th.Tensor:
         """PPO's loss plus the weighted KL to the learner."""
         surrogate = clipped_surrogate(guider.log_prob(batch.actions) - batch.old_log_prob, batch.advantages, epsilon)

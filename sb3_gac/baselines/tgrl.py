@@ -121,6 +121,11 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         teacher_coef = AdditiveCoefficient(self.teacher_coef, self.coef_step, (0.0, 1e4), self.device)
         return super().make_coefficients() | {"teacher_coef": teacher_coef}
 
+    def take_effect(self, changed: set[str]) -> None:
+        """See :meth:`AsymmetricAlgorithm.take_effect`; here is the size of the steps of the teacher's weight."""
+        super().take_effect(changed)
+        self.coefficients["teacher_coef"].step = self.coef_step  # type: ignore[union-attr]
+
     # --- algorithm ----------------------------------------------------------------------------------------------------
 
     def update(self, batch: Batch) -> Metrics:

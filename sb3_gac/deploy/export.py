@@ -128,8 +128,9 @@ def export_learner(
         :func:`sb3_gac.deploy.verification.check_agreement`
     :return: path of the file
     :raises ValueError: if the suffix is another, ``verify_on`` is no integer above 0, a unit is for an entry that the policy
-        does not read, the model learned under a ``VecNormalize`` that it does not have any more, or a wrapper outside of
-        ``VecNormalize`` changes the observations
+        does not read, the model learned under a ``VecNormalize`` that it does not have any more, a wrapper outside of
+        ``VecNormalize`` changes the observations, or ``normalizer`` normalises other entries than those that the policy read
+        normalised in training
     :raises ImportError: if an ONNX file is wanted, and onnx or onnxruntime is not installed
     :raises ExportError: if the file's actions are not those of ``predict``; no file is then written
     """
@@ -137,7 +138,10 @@ def export_learner(
     if path.suffix not in WRITERS:
         raise ValueError(f'path must end in ".onnx" or, for TorchScript, ".pt", got {str(path)!r}.')
     check_integer("verify_on", verify_on, 1)
-    normalizer = _normalizer_of(model) if normalizer is None else normalizer
+    if normalizer is None:
+        normalizer = _normalizer_of(model)
+    else:
+        _check_normalizes_as_in_training(normalizer, model)
     module = DeployedModule(deepcopy(model.policy.deployed), normalizer).cpu().eval().requires_grad_(False)
     metadata = json.dumps(describe(module, type(model).__name__, units or {}), allow_nan=False)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -168,6 +172,24 @@ def _normalizer_of(model: AsymmetricAlgorithm) -> DeploymentNormalizer | None:
             "with the statistics of what the policy reads."
         )
     return normalizer
+
+
+def _check_normalizes_as_in_training(normalizer: DeploymentNormalizer, model: AsymmetricAlgorithm) -> None:
+    trained, keys = entries_normalised_in_training(model), model.policy.deployed_entries
+    if trained is None:
+        return
+    raw = [key for key in keys if key in trained and key not in normalizer.mean]
+    if raw:
+        raise ValueError(
+            f"normalizer leaves {raw} as they are, but the policy learned from them as VecNormalize normalised them: pass "
+            f"normalizer=DeploymentNormalizer.from_vec_normalize(vec_normalize, {list(keys)})."
+        )
+    changed = [key for key in keys if key not in trained and key in normalizer.mean]
+    if changed:
+        raise ValueError(
+            f"normalizer changes {changed}, but the policy learned from them as the environment returns them: leave "
+            "normalizer out, or make it without them."
+        )
 
 
 def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> dict[str, Any]:

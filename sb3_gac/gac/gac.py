@@ -117,6 +117,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
         "learner_entropy": check_switch,
     }
     renamed_arguments: ClassVar[Mapping[str, str]] = {"std_of": "shared_std"}
+    policy_arguments = (*AsymmetricOffPolicyAlgorithm.policy_arguments, "shared_std")
     remedies = REMEDIES
     compiled_settings = (
         *AsymmetricOffPolicyAlgorithm.compiled_settings,
@@ -198,10 +199,14 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
             "shared_std": self.shared_std if self.shared_std != "auto" else ("learner" if own else "guider"),
         }
 
-    def make_coefficients(self) -> dict[str, Coefficient]:
-        """The entropy temperature and the weight of the KL."""
+    def make_schedules(self) -> None:
+        """See :meth:`AsymmetricAlgorithm.make_schedules`; here are those of the target of the KL and of ``guidance``."""
+        super().make_schedules()
         self.target_kl_schedule = PlainSchedule(AUTO_TARGET_KL if self.target_kl == "auto" else self.target_kl)
         self.guidance_schedule = PlainSchedule(self.guidance)
+
+    def make_coefficients(self) -> dict[str, Coefficient]:
+        """The entropy temperature and the weight of the KL."""
         self.target_kl_tensor, self.guidance_tensor = (th.zeros((), device=self.device) for _ in range(2))
         kl_coef = make_coefficient(
             "kl_coef", self.kl_coef, KL_COEF_START, self.kl_coef_bounds, self.kl_coef_learning_rate, self.device

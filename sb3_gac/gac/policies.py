@@ -9,6 +9,7 @@ from torch import nn
 
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles
+from sb3_gac.checks.values import check_choice
 from sb3_gac.gac.actors import GUIDERS, Guider, LaggedGuider, Learner, LearnerAsActor
 from sb3_gac.math.distributions import Distribution
 from sb3_gac.networks.actors import RolePolicy
@@ -74,6 +75,8 @@ class GACPolicy(AsymmetricPolicy):
         shared_std: str = "learner",
         **kwargs: Any,
     ):
+        check_choice("guider", guider, GUIDERS)
+        check_choice("shared_std", shared_std, SHARED_STDS)
         self.guider_class = GUIDERS[guider]
         if self.guider_class.needs_target:
             self.roles = self.roles._replace(target_policies=("learner",))  # type: ignore[misc]

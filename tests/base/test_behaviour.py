@@ -144,3 +144,11 @@ def test_shares_are_asked_for_no_moment_after_the_end():
     share = lambda progress: moments.append(progress) or 0.5 * progress  # noqa: E731
     small_model(behaviour={"learner": share}, train_freq=64).learn(100)
     assert min(moments) == 0.0
+
+
+def test_the_first_policies_of_a_training_are_those_of_its_start():
+    """The training before has left its end behind, at which the schedule's share was 1."""
+    model = small_model(TwoViewBandit(length=3), behaviour={"learner": "linear 0 -> 1"}, learning_starts=0)
+    model.learn(30)
+    ended = _episodes(model, 3)
+    assert [role for _, _, role in ended] == ["guider"]

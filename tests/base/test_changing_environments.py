@@ -5,15 +5,17 @@ import pickle
 import signal
 import warnings
 
+import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_gac.checks.environments import guard_of
+from sb3_gac.envs import SensorNoise
 from tests.base.test_collecting import KINDS, _model, kinds
 from tests.diary import Diary, DiaryEnv, assert_true_and_whole, stored_transitions
-from tests.helpers import TwoViewBandit
+from tests.helpers import TwoViewBandit, small_model
 
 
 class _Changes(BaseCallback):
@@ -136,3 +138,24 @@ def test_environments_in_this_process_are_closed_as_before():
     env = DummyVecEnv([lambda: DiaryEnv(Diary())])
     _model(env).learn(4)
     env.close()
+
+
+def _noisy(n_envs, cls):
+    return cls([lambda: Monitor(SensorNoise(TwoViewBandit(), 0.1))] * n_envs)
+
+
+@pytest.mark.parametrize("cls", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("wrap", [lambda env: env, VecNormalize])
+def test_an_attribute_is_set_on_the_layer_that_has_it(cls, wrap):
+    """SB3 sets it on Monitor, where it does nothing, and get_attr then says that it did."""
+    model = small_model(wrap(_noisy(2, cls)))
+    model.env.set_attr("noise_std", 0.4)
+    model.env.set_attr("noise_std", 0.7, indices=1)
+    assert np.ravel(model.env.get_attr("noise_std")).tolist() == pytest.approx([0.4, 0.7])
+    model.learn(10)
+    if cls is DummyVecEnv:
+        assert [float(env.env.noise_std) for env in model.env.unwrapped.envs] == pytest.approx([0.4, 0.7])
+        assert "noise_std" not in vars(model.env.unwrapped.envs[0])
+    model.env.set_attr("of_nobody", 3)
+    assert model.env.get_attr("of_nobody") == [3, 3]
+    model.env.close()

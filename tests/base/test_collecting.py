@@ -1094,3 +1094,31 @@ def test_a_buffer_that_the_model_can_not_learn_from_is_not_loaded(cls, options, 
     with pytest.raises(ValueError, match=says):
         model.load_replay_buffer(tmp_path / "buffer")
     assert model.replay_buffer is before
+
+
+SEQUENCES = {"sequence_length": 3, "burn_in": 1, "mask_truncations": True}
+
+
+@pytest.mark.parametrize("own", [{}, {"sequence_length": 5}])
+def test_a_loaded_buffer_is_sampled_as_the_models_arguments_say(own, tmp_path):
+    options = {"policy": "MultiInputGruPolicy", "learning_starts": 1_000, "policy_kwargs": {"net_arch": [8]}}
+    small_model(**options, replay_buffer_kwargs=SEQUENCES).learn(30).save_replay_buffer(tmp_path / "buffer")
+    model = small_model(**options, replay_buffer_kwargs=own)
+    expected = {name: getattr(model.replay_buffer, name) for name in SEQUENCES}
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert {name: getattr(model.replay_buffer, name) for name in SEQUENCES} == expected != SEQUENCES
+
+
+@pytest.mark.parametrize("given", [{"gamma": 0.5}, {"n_steps": 3}])
+def test_the_replay_buffers_discount_is_the_algorithms(given):
+    (name,) = given
+    with pytest.raises(ValueError, match=f"replay_buffer_kwargs has {name}=.*leave {name} out of replay_buffer_kwargs"):
+        small_model(replay_buffer_kwargs=given)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_a_new_discount_counts_in_batches(n_steps):
+    model = small_model(learning_starts=10, n_steps=n_steps).learn(20)
+    model.gamma = 0.5
+    model.learn(5, reset_num_timesteps=False)
+    assert set(model._sample_batch(64).discounts.unique().tolist()) <= {0.5, 0.25, 0.125}

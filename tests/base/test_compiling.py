@@ -1,11 +1,13 @@
 """compile="auto": what is decided when learning begins, and that a stopped run goes on with it."""
 
 import sys
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from torch._dynamo.exc import TorchDynamoException
 
 from sb3_gac import GAC, GPOClip
@@ -170,3 +172,26 @@ def test_training_without_learning_compiles_on_request_alone():
     for argument in (False, True, "auto"):
         model = SimpleNamespace(compile=argument, _compiles_on_auto=False)
         assert compiling.Compilation.compiles.fget(model) == (argument is True)
+
+
+class _Sets(BaseCallback):
+    """Sets tau to one value after the other."""
+
+    def __init__(self, values):
+        super().__init__()
+        self.values = iter(values)
+
+    def _on_step(self):
+        self.model.tau = next(self.values, self.model.tau)
+        return True
+
+
+@pytest.mark.parametrize(("n_values", "warns"), [(3, False), (4, True), (9, True)])
+def test_a_setting_that_keeps_changing_is_warned_of_once(n_values, warns):
+    model = _auto(compile=True)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(40, callback=_Sets(0.01 + 0.001 * np.arange(10 + n_values)))
+    told = [str(warning.message) for warning in caught if "compiled for the 4th time" in str(warning.message)]
+    assert len(told) == warns
+    assert all("tau" in message and "compile=False" in message for message in told)

@@ -5,9 +5,10 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, clone_behaviour, copy_networks, demonstrate
+from sb3_gac import GAC, AsymmetricMPO, AsymmetricSAC, clone_behaviour, copy_networks, demonstrate
 from sb3_gac.base.imitation import Demonstrations
 from sb3_gac.envs import make_vec
+from sb3_gac.networks.encoders import VectorExtractor
 from tests.helpers import TwoViewBandit, small_model
 
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "buffer_size": 500, "learning_starts": 20, "seed": 0}
@@ -55,6 +56,49 @@ def test_a_residual_guider_starts_at_what_was_cloned(env):
     guided, _ = model.predict_guider(dict(shown.observations), deterministic=True)
     learned, _ = model.predict(dict(shown.observations), deterministic=True)
     assert np.abs(guided - learned).mean() < 0.1
+
+
+def _target_of_mpo(env):
+    model = AsymmetricMPO("MultiInputPolicy", env, **SMALL)
+    return model, [(model.policy.actor, model.policy.actor_target)]
+
+
+def _target_of_a_lagged_guider(env):
+    model = GAC("MultiInputPolicy", env, guider="lagged", **SMALL)
+    return model, [(model.policy.learner, model.policy.learner_target)]
+
+
+def _targets_of_critics_that_share_the_encoder(env):
+    options = {"share_features_extractor": True, "features_extractor_class": Encoder, "net_arch": [16]}
+    model = GAC("MultiInputPolicy", env, **SMALL | {"policy_kwargs": options})
+    pairs = [getattr(model.policy, name) for name in ("learner_critic", "learner_critic_target")]
+    return model, [tuple(network.features_extractor for network in pairs)]
+
+
+class Encoder(VectorExtractor):
+    """With parameters of its own."""
+
+    def __init__(self, observation_space, **kwargs):
+        super().__init__(observation_space, **kwargs)
+        self.linear = th.nn.Linear(self.features_dim, self.features_dim)
+
+    def forward(self, observations):
+        return self.linear(super().forward(observations))
+
+
+TARGETS = [_target_of_mpo, _target_of_a_lagged_guider, _targets_of_critics_that_share_the_encoder]
+
+
+@pytest.mark.parametrize("make", TARGETS, ids=lambda make: make.__name__)
+def test_targets_begin_at_what_was_cloned(env, make):
+    model, pairs = make(env)
+    before = [value.clone() for network, _ in pairs for value in network.state_dict().values()]
+    clone_behaviour(model, _made_up(env, lambda partial: 2.0 * np.tanh(partial[:, :1])), gradient_steps=20, batch_size=64)
+    after = [value for network, _ in pairs for value in network.state_dict().values()]
+    assert any(not one.equal(other) for one, other in zip(before, after, strict=True))
+    for network, target in pairs:
+        for name, value in network.state_dict().items():
+            assert target.state_dict()[name].equal(value), name
 
 
 def test_choices_are_cloned(choices):

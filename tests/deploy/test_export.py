@@ -445,3 +445,24 @@ def test_statistics_of_what_the_policy_does_not_read_are_not_asked_for(tmp_path)
     env = VecNormalize(DummyVecEnv([TwoViewBandit]), norm_obs_keys=["privileged"])
     small_model(env).learn(20).save(tmp_path / "model")
     export_learner(GAC.load(tmp_path / "model", device="cpu"), tmp_path / "learner.pt")
+
+
+def _reads_two(env):
+    return GAC("MultiInputPolicy", env, role_keys=READS_TWO, policy_kwargs={"net_arch": [8]}, learning_starts=10, device="cpu")
+
+
+def test_a_normalizer_that_leaves_out_an_entry_is_refused(tmp_path):
+    env = VecNormalize(DummyVecEnv([lambda: Sampled(SEVERAL)]))
+    model = _reads_two(env).learn(20)
+    with pytest.raises(ValueError, match=r"normalizer leaves \['proprio'\] as they are.*\['partial', 'proprio'\]\)"):
+        export_learner(model, tmp_path / "learner.pt", DeploymentNormalizer.from_vec_normalize(env))
+    assert not list(tmp_path.iterdir())
+    export_learner(model, tmp_path / "learner.pt", DeploymentNormalizer.from_vec_normalize(env, ["partial", "proprio"]))
+
+
+def test_a_normalizer_of_what_the_policy_read_raw_is_refused(tmp_path):
+    env = VecNormalize(DummyVecEnv([lambda: Sampled(SEVERAL)]), norm_obs_keys=["partial"])
+    other = VecNormalize(DummyVecEnv([lambda: Sampled(SEVERAL)]))
+    model = _reads_two(env).learn(20)
+    with pytest.raises(ValueError, match=r"normalizer changes \['proprio'\], but the policy learned from them as the env"):
+        export_learner(model, tmp_path / "learner.pt", DeploymentNormalizer.from_vec_normalize(other, ["partial", "proprio"]))

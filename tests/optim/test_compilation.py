@@ -95,6 +95,16 @@ def test_compiled_training_goes_on_through_whatever_changes(algorithm, tmp_path,
     _assert_equal(plain, loaded, rtol=1e-4, atol=1e-6)
 
 
+def test_a_coefficient_that_is_set_counts_in_compiled_steps(traced):
+    plain, compiled = _collected("gac"), _collected("gac", compile=True)
+    _train((plain, compiled))
+    for model in (plain, compiled):
+        model.kl_coef = 5.0
+    _train((plain, compiled))
+    assert compiled._last_metrics["kl_coef"] == 5.0
+    _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
+
+
 def test_each_phase_is_a_program_of_its_own():
     """And what rests in one of them stays as it is."""
     plain, compiled = _filled(RMA, history=7), _filled(RMA, history=7, compile=True)
