@@ -31,6 +31,7 @@ from sb3_gac.checks.arguments import (
     check_arguments,
     make_arguments_plain,
 )
+from sb3_gac.checks.policy import check_policy_kwargs
 from sb3_gac.checks.requirements import warn_of_an_unseen_goal
 from sb3_gac.checks.scale import check_same_scale
 from sb3_gac.checks.values import plain
@@ -146,6 +147,7 @@ class AsymmetricAlgorithm(
             raise ValueError("env must be an environment, got None: load() alone can do without.")
         check_action_space(type(self).__name__, self.action_space)
         check_arguments(self)
+        check_policy_kwargs(self.policy_kwargs)
         roles = self.policy_class.roles
         seen = resolve_role_keys(self.observation_space, roles, self.role_keys)[roles.deployed]
         warn_of_an_unseen_goal(roles.deployed, seen, self.observation_space)

@@ -26,7 +26,8 @@ from sb3_gac.base.recording import Recording
 from sb3_gac.base.roles import RoleKeys, resolve_role_keys, resolve_update_every
 from sb3_gac.checks.arguments import COMMON_CHECKS, OFF_POLICY_CHECKS, ArgumentCheck, check_train_freq
 from sb3_gac.checks.entries import check_held_by
-from sb3_gac.checks.requirements import check_goals, check_rewards_of_goals
+from sb3_gac.checks.policy import check_replay_buffer_kwargs
+from sb3_gac.checks.requirements import check_action_noise, check_goals, check_rewards_of_goals
 from sb3_gac.networks.heads import resolve_target_entropy
 from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
@@ -177,8 +178,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_train_freq("train_freq", self.train_freq, self.n_envs)
-        if self.action_noise is not None and not isinstance(self.action_space, spaces.Box):
-            raise ValueError("action_noise can be added to Box actions only: leave it out.")
+        check_action_noise(self.action_noise, self.action_space)
         assert isinstance(self.observation_space, spaces.Dict)
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
         self._check_replay_buffer_kwargs()
@@ -195,6 +195,8 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
 
     def _check_replay_buffer_kwargs(self) -> None:
+        default = EpisodeReplayBuffer if self.is_recurrent else CompactDictReplayBuffer
+        check_replay_buffer_kwargs(self.replay_buffer_class or default, self.replay_buffer_kwargs)
         for name in ("n_steps", "gamma"):
             value, own = self.replay_buffer_kwargs.get(name), getattr(self, name)
             if value is not None and value != own:

@@ -42,7 +42,13 @@ class OptimizedPolicy(ActingPolicy):
             network = getattr(self, role)
             own = [parameter for parameter in network.parameters() if owners[id(parameter)] == role]
             group = {"params": own, "lr_scale": lr_scales[role]}
-            network.optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+            try:
+                network.optimizer = optimizer_class([group], lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+            except (TypeError, ValueError) as error:
+                given = f"optimizer_kwargs={self.optimizer_kwargs}"
+                raise ValueError(
+                    f"{given} does not fit {getattr(optimizer_class, '__name__', optimizer_class)}: {error}"
+                ) from error
             self.trained[role] = TrainedParameters(own, network.optimizer, self.unclipped(role), self._memory_of(role))
             self.trained[role].scale_memory(lr_scales[MEMORY])
 

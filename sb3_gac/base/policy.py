@@ -23,6 +23,7 @@ from sb3_gac.base.roles import (
     resolve_role_keys,
     role_space,
 )
+from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.checks.entries import ObservationReader
 from sb3_gac.checks.values import check_choice, check_integer
 from sb3_gac.networks.actors import Actor, RolePolicy
@@ -283,9 +284,13 @@ class AsymmetricPolicy(ConstructorArguments, OptimizedPolicy):
         extractor = self._role_extractors[role]
         if extractor is not CombinedExtractor:
             return extractor(space, **self.features_extractor_kwargs)
-        return (
-            VectorExtractor(space) if VectorExtractor.fits(space) else EntryExtractor(space, **self.features_extractor_kwargs)
-        )
+        known = constructor_parameters(EntryExtractor)[1:]
+        unknown = [name for name in self.features_extractor_kwargs if name not in known]
+        if unknown:
+            raise ValueError(f"features_extractor_kwargs has {unknown}; the default encoders take {known}.")
+        if VectorExtractor.fits(space):
+            return VectorExtractor(space)
+        return EntryExtractor(space, **self.features_extractor_kwargs)
 
     def _sees_deployed(self, role: str) -> bool:
         """Whether the role reads any of the deployed policy's entries."""

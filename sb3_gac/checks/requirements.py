@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -40,6 +41,27 @@ def check_environment(env: GymEnv) -> None:
     check_entries(env.observation_space)
     if isinstance(env.action_space, spaces.Box):
         check_box_actions(env.action_space)
+
+
+def check_action_noise(noise: ActionNoise | None, space: spaces.Space) -> None:
+    """
+    Check that noise can be added to an environment's actions.
+
+    :param noise: noise, as it was given or as SB3 vectorises it; ``None`` for none
+    :param space: space of the actions
+    :raises ValueError: if actions are not Box, or the noise has another number of components than an action
+    """
+    if noise is None:
+        return
+    if not isinstance(space, spaces.Box):
+        raise ValueError("action_noise can be added to Box actions only: leave it out.")
+    mean = getattr(noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise, "_mu", None)
+    n_actions = int(np.prod(space.shape))
+    if mean is not None and np.size(mean) != n_actions:  # SB3's own classes have a mean
+        raise ValueError(
+            f"action_noise must have as many components as an action, {n_actions}, but its mean has {np.size(mean)}: for "
+            f"example NormalActionNoise(numpy.zeros({n_actions}), 0.1 * numpy.ones({n_actions}))."
+        )
 
 
 def warn_of_an_unseen_goal(role: str, seen: Collection[str], space: spaces.Space) -> None:

@@ -5,6 +5,7 @@ import inspect
 import numpy as np
 import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -33,9 +34,15 @@ SHARED = {
         'train_freq must be an integer >= 1 or .integer >= 1, "step" or "episode".',
     ),
     "gradient_steps": ([-2, 0.5, "many", None], "gradient_steps must be an integer >= -1"),
-    "action_noise": ([0.1, "normal"], "action_noise must be an ActionNoise or None"),
+    "action_noise": (
+        [0.1, "normal", NormalActionNoise(np.zeros(3), np.ones(3))],
+        "action_noise must (be an ActionNoise or None|have as many components as an action, 1, but its mean has 3)",
+    ),
     "replay_buffer_class": ([ReplayBuffer, dict, "DictReplayBuffer"], "replay_buffer_class.*DictReplayBuffer"),
-    "replay_buffer_kwargs": ([3, ["storage_dtype"]], "replay_buffer_kwargs must be a dict or None"),
+    "replay_buffer_kwargs": (
+        [3, ["storage_dtype"], {"storage_dtyp": "float16"}, {"of_nobody": 1}],
+        r"replay_buffer_kwargs( must be a dict or None| has \"(storage_dtyp|of_nobody)\", which is no argument of Com)",
+    ),
     "optimize_memory_usage": (["yes", 2, None], r"optimize_memory_usage must be one of \[False, True\]"),
     "n_steps": ([0, -1, 1.5, "three", None], "n_steps must be an integer >= 1"),
     "ent_coef": (["automatic", "auto_zero", "auto_-1", "auto_0", -1, NAN, INF, None], 'ent_coef must be "auto"'),
@@ -77,8 +84,25 @@ SHARED = {
             {"rnn_hidden_size": 0},
             {"log_std_bounds": (1, -1)},
             {"log_std_bounds": 1},
+            {"activation_fn": "relu"},
+            {"optimizer_class": "adam"},
+            {"optimizer_kwargs": 3},
+            {"optimizer_kwargs": {"lr": 1e-3}},
+            {"optimizer_kwargs": {"betas": 0.9}},
+            {"optimizer_kwargs": {"weight_dcay": 0.1}},
+            {"features_extractor_class": "cnn"},
+            {"features_extractor_class": {"critic": "cnn"}},
+            {"features_extractor_kwargs": [3]},
+            {"features_extractor_kwargs": {"cnn_output": 3}},
+            {"share_features_extractor": "no"},
+            {"normalize_images": "a"},
+            {"rnn_net_arch": -1},
+            {"rnn_net_arch": [0]},
+            {"rnn_net_arch": "8"},
         ],
-        r"(policy_kwargs must be a dict|net_arch.* must be|n_critics must be|rnn_hidden_size must be|log_std_bounds must be)",
+        r"(policy_kwargs must be a dict|(net_arch.*|n_critics|rnn_hidden_size|log_std_bounds|activation_fn|optimizer_class|"
+        r"features_extractor_class|features_extractor_kwargs|share_features_extractor|normalize_images|rnn_net_arch|"
+        r"optimizer_kwargs) must (be|not have)|optimizer_kwargs=.* does not fit Adam|features_extractor_kwargs has .* take)",
     ),
     "verbose": ([-1, 0.5, "loud", None], "verbose must be an integer >= 0"),
     "seed": ([-1, 2**32, 0.5, "random"], "seed must be an integer from 0 to 4294967295, or None"),
