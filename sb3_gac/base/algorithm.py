@@ -90,7 +90,7 @@ class AsymmetricAlgorithm(
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         """See SB3's method; schedules are asked for no moment after the end, which a last rollout may go beyond."""
-        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        super()._update_current_progress_remaining(num_timesteps, max(total_timesteps, 1))  # learn(0) is no training
         self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
 
     def _setup_model(self) -> None:
