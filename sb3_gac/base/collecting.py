@@ -1,10 +1,8 @@
 """The loop that collects data: it stores each step that was taken, and no other, whoever stops or interrupts it."""
 
-import inspect
 import warnings
 from collections.abc import Callable
 from copy import deepcopy
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,18 +15,10 @@ from stable_baselines3.common.utils import should_collect_more_steps
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_gac.base.faults import check_same_spaces_as
-from sb3_gac.checkpoint.rows import SavedBlocks, read_rows, write_rows
+from sb3_gac.base.replay_data import check_number
 from sb3_gac.checks.arguments import check_train_freq
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.source import ReplaySource
-
-#: Options of this package's replay buffers that say how to sample, not what is stored
-SAMPLING_OPTIONS = ("n_steps", "gamma", "sequence_length", "burn_in", "mask_truncations")
-
-
-class OtherNumberOfEnvironmentsError(AssertionError, ValueError):
-    """The replay buffer was filled by another number of environments than the model has. SB3 raises AssertionError here."""
 
 
 class DataCollection(OffPolicyAlgorithm):
@@ -45,67 +35,17 @@ class DataCollection(OffPolicyAlgorithm):
     #: Number of steps of each environment, and of episodes, in the rollout under way
     _rollout_steps = 0
     _rollout_episodes = 0
-    _replay_source: ReplaySource | None = None
-    _saved_blocks: SavedBlocks | None = None
     _resumed_noise: Any = None
     _returns_so_far: Any
     _behaviour_state: Any
-    _make_replay_buffer: Callable[[], ReplayBuffer]
-    _replay_buffer_options: Callable[[], dict[str, Any]]
     _fit_action_noise: Callable[[], None]
-    check_samples_from: Callable[[type[ReplayBuffer] | None], None]
     note_use: Callable[[], None]
     call_hooks: Callable[[np.ndarray], None]
     follow_arguments: Callable[[], None]
+    replay_source: ReplaySource
+    _check_what_is_held: Callable[[ReplayBuffer, ReplaySource], None]
+    _make_replay_buffer: Callable[[], ReplayBuffer]
     reset_if_used_elsewhere: Callable[[VecEnv], None]
-
-    @property
-    def replay_source(self) -> ReplaySource:
-        """The source of what the replay buffer stores, for the present environments."""
-        assert self.env is not None
-        if self._replay_source is None or self._replay_source.env is not self.env:
-            self._replay_source = ReplaySource(self.env)
-            self._check_replay_source(self._replay_source)
-        return self._replay_source
-
-    @property
-    def sampling_env(self) -> Any:
-        """The argument ``env`` for ``ReplayBuffer.sample``, which normalises the samples; ``None`` without normalisation."""
-        return None if self.env is None else self.replay_source.sampling_env
-
-    def _check_replay_source(self, source: ReplaySource) -> None:
-        if self.replay_buffer is not None:
-            self._check_what_is_held(self.replay_buffer, source)
-        if source.in_the_way is None:
-            return
-        names = f"{type(source.in_the_way).__name__} stands outside VecNormalize"
-        remedy = f"make it VecNormalize({type(source.in_the_way).__name__}(env))"
-        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, HerReplayBuffer):
-            raise ValueError(
-                f"{names}: goals would be stored normalised, and HerReplayBuffer computes rewards from raw ones: {remedy}."
-            )
-        warnings.warn(
-            f"{names}: the replay buffer holds observations as they were normalised when they were seen. To have them "
-            f"normalised with the newest statistics whenever they are sampled, {remedy}.",
-            stacklevel=4,
-        )
-
-    def _check_what_is_held(self, buffer: ReplayBuffer, source: ReplaySource) -> None:
-        """
-        Check that the replay buffer goes on with the kind of observations that it holds.
-
-        :raises ValueError: if stored observations are normalised and those to come are raw, or the reverse
-        """
-        normalised = source.in_the_way is not None
-        held = getattr(buffer, "holds_normalised", normalised) if buffer.size() else normalised
-        if held != normalised:
-            ways = ("raw", "normalised as they were seen")
-            wrapper = f"{'no' if held else 'a'} wrapper outside VecNormalize changes them"
-            raise ValueError(
-                f"The replay buffer holds observations {ways[held]}, but new observations would be {ways[normalised]}, "
-                f"because {wrapper}: wrap the environments as before, or leave the buffer out."
-            )
-        buffer.holds_normalised = normalised  # type: ignore[attr-defined]
 
     # --- other environments -----------------------------------------------------------------------------------------
 
@@ -119,7 +59,7 @@ class DataCollection(OffPolicyAlgorithm):
         buffer = self.replay_buffer
         if buffer is not None and buffer.n_envs != env.num_envs:
             if buffer.size() > 0:
-                _check_number(buffer, env.num_envs, f"{type(self).__name__}.load(path, env=...) takes any number")
+                check_number(buffer, env.num_envs, f"{type(self).__name__}.load(path, env=...) takes any number")
             self.replay_buffer = None
         if env.num_envs != self.n_envs:
             check_train_freq("train_freq", self.train_freq, env.num_envs)
@@ -132,69 +72,6 @@ class DataCollection(OffPolicyAlgorithm):
             self.replay_buffer.env = self.env  # whose compute_reward rewards goals; SB3 would ask the environments before
         _ = self.replay_source  # a look at it, which may raise or warn
 
-    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
-        """
-        See SB3's ``load_replay_buffer``; the model's arguments say how the buffer is sampled, not the file.
-
-        :raises ValueError: naming the observation entries whose spaces are not the model's, or the buffer's class if the model
-            can't learn from it, or if another number of environments filled the buffer; the model then keeps the buffer that
-            it had
-        """
-        before = self.replay_buffer
-        try:
-            super().load_replay_buffer(path, truncate_last_traj)
-        finally:
-            loaded, self.replay_buffer = self.replay_buffer, before
-        assert loaded is not None
-        check_same_spaces_as(self, loaded, "replay buffer")
-        self.check_samples_from(type(loaded))
-        if self.env is not None:
-            _check_number(loaded, self.n_envs)
-        self.replay_buffer = loaded
-        self._set_sampling_options(loaded)
-
-    def _set_sampling_options(self, buffer: ReplayBuffer) -> None:
-        """Have the model's arguments say how one of this package's buffers is sampled."""
-        if isinstance(buffer, CompactDictReplayBuffer):
-            options = self._replay_buffer_options()
-            defaults = {name: _default(type(buffer), name) for name in SAMPLING_OPTIONS if hasattr(buffer, name)}
-            vars(buffer).update({name: options.get(name, default) for name, default in defaults.items()})
-
-    # --- checkpoints ------------------------------------------------------------------------------------------------
-
-    def save_data(self, root: Path) -> tuple[dict[str, Any], list[str]]:
-        """
-        Write the rows of the replay buffer that have changed since the last checkpoint.
-
-        :param root: folder of all checkpoints of a run
-        :return: state of the buffer besides its rows, and the names of all blocks of rows
-        :raises TypeError: if there is no replay buffer, or it is of another class than this package's
-        """
-        buffer = self.replay_buffer
-        if buffer is None:
-            raise TypeError("There is no replay buffer to write down: set_env() gives one to a model that was loaded without.")
-        if not isinstance(buffer, CompactDictReplayBuffer):
-            raise TypeError(
-                f"A checkpoint can hold a CompactDictReplayBuffer or a subclass, but replay_buffer_class is "
-                f"{type(buffer).__name__}: leave it out, or use save() and save_replay_buffer()."
-            )
-        self._saved_blocks = write_rows(buffer, root, self._saved_blocks)
-        return buffer.bookkeeping() | {"blocks": self._saved_blocks.names}, self._saved_blocks.names
-
-    def restore_data(self, root: Path, saved: dict[str, Any]) -> None:
-        """
-        Restore the replay buffer, and keep the restored action noise, which SB3 would reset at the next ``learn``.
-
-        :param root: folder of all checkpoints of a run
-        :param saved: first value that :meth:`save_data` returned
-        """
-        buffer = self.replay_buffer
-        assert isinstance(buffer, CompactDictReplayBuffer)
-        names = saved.pop("blocks")
-        buffer.restore_bookkeeping(saved)
-        self._saved_blocks = read_rows(buffer, root, names)
-        self._resumed_noise = self.action_noise
-
     # --- episodes ---------------------------------------------------------------------------------------------------
 
     def _setup_learn(self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any) -> Any:
@@ -202,7 +79,7 @@ class DataCollection(OffPolicyAlgorithm):
         if self.replay_buffer is None and self.env is not None:
             self.replay_buffer = self._make_replay_buffer()
         if self.replay_buffer is not None:
-            _check_number(self.replay_buffer, self.n_envs)
+            check_number(self.replay_buffer, self.n_envs)
         if reset_num_timesteps:
             self._rollout_steps, self._rollout_episodes = 0, 0
         noise, self._resumed_noise = deepcopy(self._resumed_noise), None
@@ -311,20 +188,4 @@ class DataCollection(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         of_the_data = ["_rollout_steps", "_rollout_episodes"]  # of the rollout under way, which a model's file does not hold
-        of_files = ["_saved_blocks", "_resumed_noise"]
-        return [*super()._excluded_save_params(), "_replay_source", *of_the_data, *of_files]
-
-
-def _default(buffer_class: type, option: str) -> Any:
-    """Default of an option of a class of replay buffers, or of the ancestor to which its constructor hands the option on."""
-    constructors = (vars(ancestor)["__init__"] for ancestor in buffer_class.__mro__ if "__init__" in vars(ancestor))
-    parameters = (inspect.signature(constructor).parameters for constructor in constructors)
-    return next(named[option].default for named in parameters if option in named)
-
-
-def _check_number(buffer: Any, n_envs: int, remedy: str = "load the model with as many environments") -> None:
-    if buffer.n_envs != n_envs:
-        raise OtherNumberOfEnvironmentsError(
-            f"The replay buffer was filled by {buffer.n_envs} environments, but the model has {n_envs}: {remedy}, or leave "
-            "the buffer out."
-        )
+        return [*super()._excluded_save_params(), "_resumed_noise", *of_the_data]

@@ -8,9 +8,7 @@ from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self, Unpack
 
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
@@ -23,23 +21,22 @@ from sb3_gac.base.off_policy_acting import OffPolicyActing
 from sb3_gac.base.overrides import check_known, check_unchanged
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.recording import Recording
+from sb3_gac.base.replay_data import ReplayData
 from sb3_gac.base.roles import RoleKeys, resolve_role_keys, resolve_update_every
 from sb3_gac.checks.arguments import COMMON_CHECKS, OFF_POLICY_CHECKS, ArgumentCheck, check_train_freq
 from sb3_gac.checks.entries import check_held_by
-from sb3_gac.checks.policy import check_replay_buffer_kwargs
 from sb3_gac.checks.requirements import check_action_noise, check_goals, check_rewards_of_goals
 from sb3_gac.networks.heads import resolve_target_entropy
 from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
-from sb3_gac.replay.episodes import EpisodeReplayBuffer, check_learns_from_sequences
-from sb3_gac.replay.histories import check_samples_histories
+from sb3_gac.replay.episodes import EpisodeReplayBuffer
 
 ENT_COEF_START = 0.1
 _EPISODE = 1_000
 ENT_COEF_BOUNDS = (1e-8, 1e4)
 
 
-class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCollection):  # type: ignore[override]
+class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCollection, ReplayData):  # type: ignore[override]
     """
     Base of the algorithms whose behaviour policy sees more than the policy that is deployed.
 
@@ -163,8 +160,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
             _ = self.replay_source  # a look at it, which may raise or warn
 
     def _prepare_data(self) -> dict[str, Any]:
-        if self.replay_buffer_class is None:
-            self.replay_buffer_class = EpisodeReplayBuffer if self.is_recurrent else CompactDictReplayBuffer
+        self.replay_buffer_class = self._present_buffer_class
         self._fit_action_noise()
         if self.replay_buffer is None and self.env is not None:  # a model without environments only acts, and needs no buffer
             self.replay_buffer = self._make_replay_buffer()
@@ -187,35 +183,11 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         roles = self.policy_class.roles
         seen = resolve_role_keys(self.observation_space, roles, self.role_keys)[roles.deployed]
         self._shifted_entries = shifted_entries(self.observation_space, seen, self.random_shift)
-        buffer_class = self.replay_buffer_class or CompactDictReplayBuffer
-        if self.recording is not None and not issubclass(buffer_class, CompactDictReplayBuffer):
+        if self.recording is not None and not issubclass(self._present_buffer_class, CompactDictReplayBuffer):
             raise ValueError("recording needs a CompactDictReplayBuffer: leave replay_buffer_class out.")
         self._make_behaviour()
         self.check_samples_from(self.replay_buffer_class)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
-
-    def _check_replay_buffer_kwargs(self) -> None:
-        default = EpisodeReplayBuffer if self.is_recurrent else CompactDictReplayBuffer
-        check_replay_buffer_kwargs(self.replay_buffer_class or default, self.replay_buffer_kwargs)
-        for name in ("n_steps", "gamma"):
-            value, own = self.replay_buffer_kwargs.get(name), getattr(self, name)
-            if value is not None and value != own:
-                raise ValueError(
-                    f"replay_buffer_kwargs has {name}={value}, but {type(self).__name__} has {name}={own}, which the replay "
-                    f"buffer follows: leave {name} out of replay_buffer_kwargs."
-                )
-
-    def check_samples_from(self, replay_buffer_class: type[ReplayBuffer] | None) -> None:
-        """
-        Check that a class of replay buffers has the kind of batches that the algorithm learns from.
-
-        :param replay_buffer_class: class of the replay buffer, ``None`` for the default
-        :raises ValueError: if the class has none; the message names it
-        """
-        if self.is_recurrent:
-            check_learns_from_sequences(replay_buffer_class, self.n_steps)
-        if self.samples_histories:
-            check_samples_histories(replay_buffer_class)
 
     def check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
         """See :meth:`ResumableAlgorithm.check_fixed_arguments`; the replay buffer's storage options are fixed as well."""
@@ -261,27 +233,6 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
                     f"{type(self).__name__} has no entropy term, so {name} would do nothing: leave it out, got "
                     f"{getattr(self, name)!r}."
                 )
-
-    def _make_replay_buffer(self) -> ReplayBuffer:
-        assert self.replay_buffer_class is not None
-        options = self._replay_buffer_options()
-        if issubclass(self.replay_buffer_class, HerReplayBuffer):
-            options["env"] = self.env
-        return self.replay_buffer_class(
-            self.buffer_size,
-            self.observation_space,
-            self.action_space,
-            device=self.device,
-            n_envs=self.n_envs,
-            optimize_memory_usage=self.optimize_memory_usage,
-            **options,
-        )
-
-    def _replay_buffer_options(self) -> dict[str, Any]:
-        """Keyword arguments of the replay buffer's class, with those that the algorithm itself was given."""
-        assert self.replay_buffer_class is not None
-        ours = issubclass(self.replay_buffer_class, CompactDictReplayBuffer)
-        return {**({"n_steps": self.n_steps, "gamma": self.gamma} if ours else {}), **self.replay_buffer_kwargs}
 
     # --- learning ---------------------------------------------------------------------------------------------------
 
