@@ -25,6 +25,7 @@ from benchmarks.bootstrap import Estimate, estimate, improvements, interval
 from benchmarks.finished import (
     FinishedRun,
     add_reuse_options,
+    as_json,
     kind_of,
     name_of,
     names_of,
@@ -309,7 +310,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "cells": summarise_cells(tidy, reference),
         **compare(tidy),
     }
-    file_of(options.out, "json").write_text(json.dumps(results, indent=1, allow_nan=False))
+    file_of(options.out, "json").write_text(json.dumps(as_json(results), indent=1, allow_nan=False))
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
 import argparse
 import json
+import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +17,9 @@ from benchmarks.suite import UNSAID, RunSpec, made_with
 from benchmarks.tidy import NAMES, NEEDED, NO_NOISE, file_of, read_tidy
 
 _PARTICULARS = ["environment", "definition", "needs", "history"]
+#: Infinite number -> YAML's word for it, in JSON, which has no such numbers; and the reverse
+_WORDS = {math.inf: ".inf", -math.inf: "-.inf"}
+_INFINITE = {word: number for number, word in _WORDS.items()}
 
 
 class FinishedRun(NamedTuple):
@@ -141,6 +145,28 @@ def read_reused(results: Sequence[Path], specs: Sequence[RunSpec], rerun: Sequen
     return {name: run for path in results for name, run in read_results(path, wanted).items()}
 
 
+def as_json(value: Any) -> Any:
+    """
+    :param value: value of which a results' file is made
+    :return: the same with YAML's words for infinite numbers, which JSON has not
+    """
+    return _each(lambda one: _WORDS.get(one, one) if isinstance(one, float) else one, value)
+
+
+def from_json(value: Any) -> Any:
+    """
+    :param value: value from a results' file
+    :return: value that :func:`as_json` was given
+    """
+    return _each(lambda one: _INFINITE.get(one, one) if isinstance(one, str) else one, value)
+
+
+def _each(change: Callable[[Any], Any], value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _each(change, part) for key, part in value.items()}
+    return [_each(change, part) for part in value] if isinstance(value, (list, tuple)) else change(value)
+
+
 def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]:
     """
     :param path: path of results, without a suffix
@@ -148,7 +174,7 @@ def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]
     :return: run's name -> records of each run that was found, if it was made with the settings and arguments of today's suite
     :raises ValueError: if the results have no record of single runs
     """
-    results = json.loads(file_of(path, "json").read_text())
+    results = from_json(json.loads(file_of(path, "json").read_text()))
     if "runs" not in results:
         raise ValueError(
             f"{file_of(path, 'json')} does not tell its runs apart: it was aggregated before they could be taken up again."

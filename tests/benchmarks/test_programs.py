@@ -3,6 +3,7 @@
 import importlib
 import itertools
 import json
+import math
 import re
 import shutil
 import signal
@@ -30,7 +31,7 @@ from benchmarks.checkpoint import SB3Checkpoints, checkpoints_of
 from benchmarks.config import check_runs, read_algorithm, resolve
 from benchmarks.environments import environment
 from benchmarks.external import Program
-from benchmarks.finished import kind_of, name_of, names_of, particulars_of, read_reused, settings_of
+from benchmarks.finished import as_json, from_json, kind_of, name_of, names_of, particulars_of, read_reused, settings_of
 from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
 from benchmarks.suite import RunSpec, made_with, read_suite
@@ -796,6 +797,19 @@ def _results_of(suite, path, change):
     }
     path.with_suffix(".json").write_text(json.dumps(record))
     return specs
+
+
+def test_infinite_arguments_are_kept_in_results_and_read_again(tmp_path):
+    """JSON has no such numbers; the paper's recipe by Brax clips observations to infinity, which is to clip nothing."""
+    suite = ROOT / "benchmarks/suites/brax-choices.yml"
+    specs = _results_of(suite, tmp_path / "made", lambda spec, arguments: as_json(arguments))
+    recorded = (tmp_path / "made.json").read_text()
+    assert "Infinity" not in recorded
+    assert '".inf"' in recorded
+    found = read_reused([tmp_path / "made"], specs, ())
+    assert len(found) == len(specs)
+    assert {run.arguments["normalize"]["clip_obs"] for run in found.values()} == {math.inf}
+    assert from_json(as_json({"a": [-math.inf, 1.5, "text"], "b": None})) == {"a": [-math.inf, 1.5, "text"], "b": None}
 
 
 STDS = ROOT / "benchmarks/suites/guider-std.yml"
