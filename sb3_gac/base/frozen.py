@@ -1,13 +1,9 @@
 """Frozen policies: teachers, which are asked for their actions and never trained."""
 
-import random
-from collections.abc import Iterator
-from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
@@ -17,6 +13,7 @@ from torch import nn
 
 from sb3_gac.base.loading import class_of_model
 from sb3_gac.base.policy import AsymmetricPolicy
+from sb3_gac.base.random_state import random_numbers_kept
 from sb3_gac.checks.entries import encode, leading_dimensions
 from sb3_gac.checks.scale import entries_normalised_in_training
 from sb3_gac.math.distributions import TanhGaussian
@@ -104,15 +101,5 @@ def _loaded(path: Path, device: th.device, name: str) -> BaseAlgorithm:
         raise ValueError(
             f"{name}={str(path)!r} is no model of a class that can be imported: pass the loaded model itself."
         ) from None
-    with _same_random_numbers():  # because loading a model sets its seed
+    with random_numbers_kept():  # because loading a model sets its seed
         return kind.load(path, device=device)
-
-
-@contextmanager
-def _same_random_numbers() -> Iterator[None]:
-    """Keep the random numbers of Python, numpy and torch as if none were drawn, and no seeds set, within the context."""
-    states = random.getstate(), np.random.get_state()
-    with th.random.fork_rng():
-        yield
-    random.setstate(states[0])
-    np.random.set_state(states[1])

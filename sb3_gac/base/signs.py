@@ -2,8 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_gac.base.batch import Batch
 from sb3_gac.base.comparing import ReturnComparison
+from sb3_gac.base.random_state import random_numbers_kept
 from sb3_gac.replay.episodes import holds_a_batch
 
 #: Episodes of each policy in a block; blocks share none, so that chance does not carry over from one to the next
@@ -185,16 +185,3 @@ class GuidanceSigns(ReturnComparison):
         if self.signs_in_a_row[cause] >= patience and cause not in self.signs_told:
             self.signs_told.append(cause)
             warnings.warn(f"After {self.num_timesteps} steps, {self.remedies[cause].format(**numbers)}", stacklevel=2)
-
-
-@contextmanager
-def random_numbers_kept(device: th.device) -> Iterator[None]:
-    """
-    Keep numpy's and torch's random numbers as if none were drawn within the context.
-
-    :param device: device of the networks, whose generator is kept as well
-    """
-    state = np.random.get_state()
-    with th.random.fork_rng(devices=[th.cuda.current_device()] if device.type == "cuda" else []):
-        yield
-    np.random.set_state(state)
