@@ -24,6 +24,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from benchmarks.tidy import file_of
 from sb3_gac.networks.recurrent import RecurrentCore
 from sb3_gac.training.provenance import provenance
 
@@ -180,7 +181,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="trials side by side")
     parser.add_argument("--out", required=True, help="path of the results, without a suffix")
     args = parser.parse_args()
-    path = Path(args.out).with_suffix(".json")
+    path = file_of(Path(args.out), "json")
     saved = json.loads(path.read_text())["trials"] if path.exists() else []
     known = {Trial(*(row[key] for key in Trial._fields)): row for row in saved}
     wanted = [Trial(*key) for key in itertools.product(CONTENDERS, args.delays, range(args.seeds), [args.steps])]

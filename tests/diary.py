@@ -104,7 +104,7 @@ def assert_true_and_whole(model: Any, diary: Diary, but: int = 0) -> None:
     Each stored transition is one that happened, and each that happened is stored, once.
 
     :param model: whose buffer was never full
-    :param diary: of its environments
+    :param diary: what its environments have written down
     :param but: how many of those that happened may be missing: an interrupted step of the others
     """
     found = stored_transitions(model)

@@ -17,7 +17,7 @@ class TwoViewBandit(gym.Env):
     Return of action a for target z: -(a - z)^2.  With z ~ U(-0.8, 0.8) and partial = z + N(0, noise_std), the best that
     a learner can do is the posterior mean of z.
 
-    :param noise_std: of the partial view
+    :param noise_std: standard deviation of the noise in the partial view
     :param length: steps per episode; each draws a new target
     """
 
@@ -175,7 +175,7 @@ def gradient_step(model: Any, batch_size: int, seed: int) -> Any:
 
     :param model: that has something in its replay buffer
     :param batch_size: transitions or sequences
-    :param seed: of all that is drawn
+    :param seed: seed, of which all is drawn
     :return: samples that the replay buffer gave
     """
     drawn = []
@@ -195,9 +195,9 @@ def noise_of_step(seed: int, n: int, shape: Any) -> th.Tensor:
     """
     What :func:`gradient_step` drew for the policies' actions.
 
-    :param seed: of that step
-    :param n: of actions at once
-    :param shape: of the stored actions
+    :param seed: seed before that step
+    :param n: number of actions at once
+    :param shape: shape of the stored actions
     :return: shape (n, *shape)
     """
     th.manual_seed(seed)

@@ -64,7 +64,7 @@ class Mutant:
 
     def mutated(self, root: Path) -> str:
         """
-        :param root: of the tree
+        :param root: folder of the tree
         :return: the file's text with the fault in it
         :raises MutantError: if the text to replace is not there, or there more than once, or the result does not compile
         """
@@ -87,7 +87,7 @@ class Mutant:
 
     def check(self, root: Path) -> None:
         """
-        :param root: of the tree
+        :param root: folder of the tree
         :raises MutantError: if it can't be put in, or one of its tests is not there
         """
         self.mutated(root)
@@ -110,7 +110,7 @@ def _names_in(path: Path) -> set[str]:
 
 def read_mutants(paths: Iterable[Path]) -> list[Mutant]:
     """
-    :param paths: of YAML lists of mutants
+    :param paths: paths of YAML lists of mutants
     :return: all of them
     """
     entries = [entry for path in sorted(paths) for entry in yaml.safe_load(path.read_text()) or []]
@@ -119,7 +119,7 @@ def read_mutants(paths: Iterable[Path]) -> list[Mutant]:
 
 def listed_mutants(root: Path = ROOT) -> list[Mutant]:
     """
-    :param root: of the tree
+    :param root: folder of the tree
     :return: all that its lists name
     """
     return read_mutants((root / "tests").glob("mutants*.yml"))
@@ -127,7 +127,7 @@ def listed_mutants(root: Path = ROOT) -> list[Mutant]:
 
 def copy_tree(root: Path, to: Path) -> None:
     """
-    :param root: of the tree
+    :param root: folder of the tree
     :param to: an empty directory, which gets what the tests need of it
     """
     for path in sorted(path for pattern in COPIED for path in root.glob(pattern)):
@@ -206,7 +206,7 @@ def run_mutants(
     :param mutants: to be put in, one at a time
     :param jobs: how many at once, each in a copy of its own
     :param timeout: for the tests of one mutant, in seconds
-    :param root: of the tree
+    :param root: folder of the tree
     :param tests_pass: whether it is known that the tests pass without a mutant
     :return: those that survived
     :raises MutantError: if a mutant can't be put in, or its tests fail without it
@@ -248,7 +248,7 @@ def run_mutants(
 def main(arguments: Sequence[str] | None = None, root: Path = ROOT) -> int:
     """
     :param arguments: of the command line
-    :param root: of the tree
+    :param root: folder of the tree
     :return: exit status
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -145,18 +145,18 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
     """
     policies = roles.policies
     if isinstance(net_arch, list):
-        net_arch = {**dict.fromkeys(policies, net_arch), "critic": net_arch}
+        net_arch = {**dict.fromkeys(policies, net_arch), CRITICS: net_arch}
     if isinstance(net_arch, Mapping) and set(net_arch) == {"pi", "qf"}:
-        net_arch = {**dict.fromkeys(policies, net_arch["pi"]), "critic": net_arch["qf"]}
-    if not isinstance(net_arch, Mapping) or set(net_arch) != {*policies, "critic"}:
+        net_arch = {**dict.fromkeys(policies, net_arch["pi"]), CRITICS: net_arch["qf"]}
+    if not isinstance(net_arch, Mapping) or set(net_arch) != {*policies, CRITICS}:
         raise ValueError(
-            f'net_arch must be a list, {{"pi": [...], "qf": [...]}} or one list for each of {[*policies, "critic"]}, '
+            f'net_arch must be a list, {{"pi": [...], "qf": [...]}} or one list for each of {[*policies, CRITICS]}, '
             f"got {net_arch!r}."
         )
     for sizes in net_arch.values():
         for size in sizes:
             check_integer("net_arch: a layer's size", size, 1)
-    return {role: net_arch[role if role in policies else "critic"] for role in roles.networks}
+    return {role: net_arch[role if role in policies else CRITICS] for role in roles.networks}
 
 
 def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> dict[str, float]:

@@ -16,6 +16,7 @@ from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
 from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles
+from sb3_gac.checks.arguments import ArgumentCheck
 from sb3_gac.checks.values import check_integer, check_positive
 from sb3_gac.math.losses import masked_mean
 from sb3_gac.networks.actors import Actor
@@ -99,7 +100,7 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
         "MultiInputGruPolicy": AsymmetricMPOGruPolicy,
         "MultiInputLstmPolicy": AsymmetricMPOLstmPolicy,
     }
-    argument_checks: ClassVar[Mapping[str, Any]] = {
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {
         "n_actions": partial(check_integer, low=1),
         "temperature": check_temperature,
         "target_improvement": check_positive,

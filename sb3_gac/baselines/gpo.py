@@ -20,6 +20,7 @@ from sb3_gac.base.guider import GuiderPrediction
 from sb3_gac.base.on_policy import AsymmetricOnPolicyAlgorithm
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles, role_space
+from sb3_gac.checks.arguments import ArgumentCheck
 from sb3_gac.checks.values import check_inner_fraction, check_not_negative, check_positive
 from sb3_gac.math.distributions import Distribution
 from sb3_gac.math.losses import clipped_surrogate
@@ -141,7 +142,7 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": GPOPolicy}
-    argument_checks: ClassVar[Mapping[str, Any]] = {"learner_rl_coef": check_not_negative}
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {"learner_rl_coef": check_not_negative}
     compiled_settings = (*AsymmetricOnPolicyAlgorithm.compiled_settings, "learner_rl_coef")
     policy: GPOPolicy  # type: ignore[assignment]
 
@@ -206,7 +207,7 @@ class GPOClip(GPO):
     :param delta: largest relative difference of an action's probability under the guider from the learner's, in (0, 1)
     """
 
-    argument_checks: ClassVar[Mapping[str, Any]] = {"delta": check_inner_fraction}
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {"delta": check_inner_fraction}
     compiled_settings = (*GPO.compiled_settings, "delta")
 
     def __init__(self, policy: str | type[GPOPolicy], env: GymEnv | str | None, *sb3: Any, delta: float = 0.1, **shared: Any):
@@ -239,7 +240,7 @@ class GPOPenalty(GPO):
     :param largest_kl_coef: largest value of that weight
     """
 
-    argument_checks: ClassVar[Mapping[str, Any]] = {"target_kl": check_positive, "largest_kl_coef": check_positive}
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {"target_kl": check_positive, "largest_kl_coef": check_positive}
 
     def __init__(
         self,

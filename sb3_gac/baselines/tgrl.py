@@ -18,6 +18,7 @@ from sb3_gac.base.comparing import ReturnComparison
 from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.roles import Roles
+from sb3_gac.checks.arguments import ArgumentCheck
 from sb3_gac.checks.values import check_integer, check_not_negative
 from sb3_gac.math.losses import masked_mean, policy_loss
 from sb3_gac.networks.actors import Actor
@@ -83,7 +84,7 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         "MultiInputGruPolicy": TGRLGruPolicy,
         "MultiInputLstmPolicy": TGRLLstmPolicy,
     }
-    argument_checks: ClassVar[Mapping[str, Any]] = {
+    argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {
         "teacher_coef": check_not_negative,
         "coef_step": check_not_negative,
         "compare_every": partial(check_integer, low=1),

@@ -135,7 +135,6 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
     )
 
     policy: GACPolicy
-    kl_coef_dual: Coefficient
 
     def __init__(
         self,

@@ -1,9 +1,8 @@
 """
-Opt-in compilation: a whole update, or each of its branches, becomes one graph of tensor operations.
+Opt-in compilation: a whole update becomes one graph of tensor operations.
 
 ``torch.compile`` traces losses, their gradients, clipping and Adam's steps together: all operations between two matrix
-products become one pass over memory, and no Python code runs within a step.  On the CPU the compiled code releases Python's
-lock.
+products become one pass over memory, and no Python code runs within a step.
 """
 
 import os
@@ -22,7 +21,7 @@ import torch as th
 #: Number of gradient steps from which compilation saves more than the half minute that it takes
 PAYS_FROM = 10_000
 _OPTIONS = {"cpu": {"cpp_wrapper": True}}
-_compiling = Lock()  # one thread at a time
+_compiling = Lock()  # held while the compiler works, see is_compiling()
 
 
 class CannotCompileError(ValueError):
