@@ -103,10 +103,7 @@ class AsymmetricMPO(AsymmetricOffPolicyAlgorithm):
     argument_checks: ClassVar[Mapping[str, ArgumentCheck]] = {
         "n_actions": partial(check_integer, low=1),
         "temperature": check_temperature,
-        "target_improvement": check_positive,
-        "target_kl": check_positive,
-        "target_std_kl": check_positive,
-        "dual_learning_rate": check_positive,
+        **dict.fromkeys(("target_improvement", "target_kl", "target_std_kl", "dual_learning_rate"), check_positive),
     }
     restored_arguments = (*AsymmetricOffPolicyAlgorithm.restored_arguments, *STARTS)
     compiled_settings = (
