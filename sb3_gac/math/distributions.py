@@ -211,6 +211,7 @@ class TanhGaussian(NamedTuple):
 
         log(1 - tanh(x)^2) is computed as 2 (log 2 - x - log(1 + exp(-2 x))), which does not cancel for large |x|.
         """
+        # Half of the log-density, doubled at the end: so the term of tanh is added without a factor, in one pass less
         log_cosh = pre_tanh + F.softplus(pre_tanh * -2.0)  # without its constant, -log 2
         summed = th.addcmul(th.sub(log_cosh, self.log_std, alpha=0.5), standardised, standardised, value=-0.25).sum(dim=-1)
         return 2.0 * summed - pre_tanh.shape[-1] * (_LOG_SQRT_2PI + 2.0 * math.log(2.0))

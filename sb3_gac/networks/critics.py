@@ -100,6 +100,7 @@ class CriticEnsemble(RoleModel):
         members = features if self.memory is not None else features.expand(self.n_critics, *features.shape)
         if members.dim() == 3:
             return self._values(members, actions)
+        # Of sequences, T steps of B episodes are T * B rows; K actions to each observation have an axis before those two
         flat_actions = None if actions is None else actions.flatten(-3, -2)
         several = actions is not None and actions.dim() == members.dim()
         return self._values(members.flatten(1, 2), flat_actions).unflatten(2 if several else 1, members.shape[1:3])
