@@ -25,7 +25,7 @@ if find_spec("gymnasium") is not None:
 if TYPE_CHECKING:
     from sb3_gac.base.callbacks import GuiderLearnerEvalCallback, SeededEvalCallback
     from sb3_gac.base.checkpoint_callback import ExactCheckpointCallback
-    from sb3_gac.base.imitation import clone_behaviour, copy_networks, demonstrate
+    from sb3_gac.base.imitation import Demonstrations, clone_behaviour, copy_networks, demonstrate
     from sb3_gac.base.recording import write_recording
     from sb3_gac.baselines.asymmetric_mpo import AsymmetricMPO
     from sb3_gac.baselines.asymmetric_sac import AsymmetricSAC
@@ -52,6 +52,7 @@ _WHERE = {
     "PRESETS": "sb3_gac.presets",
     "CheckpointError": "sb3_gac.checkpoint.files",
     "CompactDictReplayBuffer": "sb3_gac.replay.buffer",
+    "Demonstrations": "sb3_gac.base.imitation",
     "DeploymentNormalizer": "sb3_gac.deploy.normalization",
     "DivergenceError": "sb3_gac.checks.divergence",
     "EnvironmentFailedError": "sb3_gac.checks.environments",
@@ -107,6 +108,7 @@ __all__ = [
     "AsymmetricSAC",
     "CheckpointError",
     "CompactDictReplayBuffer",
+    "Demonstrations",
     "DeploymentNormalizer",
     "DivergenceError",
     "EnvironmentFailedError",

@@ -20,9 +20,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_gac import GAC, GuiderLearnerEvalCallback
 from sb3_gac.train import main, parse_arguments
 from sb3_gac.training import evaluation, job
+from sb3_gac.training.environments import entries_of_floats
 from sb3_gac.training.evaluation import DeployedView
 from sb3_gac.training.job import Job, finish, prepare
 from sb3_gac.training.options import algorithm_arguments
+from tests.helpers import Sampled
 
 InvertedDoublePendulum = partial(gymnasium.make, "sb3_gac/InvertedDoublePendulum-v5", noise_std=0.1)
 QUICK = ["--task", "InvertedDoublePendulum", "--steps", "400", "--seed", "3", "--episodes", "2", "--envs", "2"]
@@ -215,6 +217,27 @@ def test_a_preset_that_normalises_observations_leaves_their_statistics(tmp_path,
     assert model.trained_normalised
     results = json.loads((directory / "results.json").read_text())
     assert results["learner"] == pytest.approx(job.evaluate(DeployedView(model), statistics, 2)[0], rel=1e-3)
+
+
+def test_observations_are_normalised_on_request(tmp_path):
+    """The run's configuration says so, by which it would be resumed."""
+    small = "{learning_starts: 50, batch_size: 8, policy_kwargs: {net_arch: [8]}}"
+    main([*QUICK, "--normalize", "--overrides", small, "--history", "1", "--runs", str(tmp_path)])
+    (directory,) = tmp_path.iterdir()
+    model = GAC.load(directory / "model")
+    assert sorted(model.normalised_entries) == ["partial", "privileged"]
+    statistics = VecNormalize.load(str(directory / "vecnormalize.pkl"), DummyVecEnv([InvertedDoublePendulum] * 2))
+    assert not statistics.norm_reward
+    assert yaml.safe_load((directory / "config.yaml").read_text())["normalize"] is True
+
+
+def test_images_stay_as_they_are_where_observations_are_normalised():
+    image = spaces.Box(0, 255, (3, 36, 36), np.uint8)
+    vector = spaces.Box(-1, 1, (2,), np.float32)
+    env = DummyVecEnv([lambda: Sampled(spaces.Dict(partial=image, privileged=vector))])
+    assert entries_of_floats(env) == ["privileged"]
+    with pytest.raises(ValueError, match="--normalize: no entry of the observations holds floating-point numbers"):
+        entries_of_floats(DummyVecEnv([lambda: Sampled(spaces.Dict(partial=image, privileged=image))]))
 
 
 @pytest.mark.usefixtures("_quick")

@@ -25,7 +25,7 @@ from sb3_gac.training.provenance import provenance
 CONFIGURATION, CHECKPOINTS, RESULTS, MODEL = "config.yaml", "checkpoints", "results.json", "model"
 _OPTIONS = (
     *("task", "env", "env_kwargs", "whole_state", "noise", "privileged", "history", "algorithm", "teacher", "preset"),
-    *("overrides", "steps", "seed", "envs", "compile", "episodes", "tensorboard", "runs"),
+    *("overrides", "normalize", "steps", "seed", "envs", "compile", "episodes", "tensorboard", "runs"),
 )
 _REQUIRED = ("task", "steps", "seed", "environment")
 _PATHS = ("runs", "teacher")

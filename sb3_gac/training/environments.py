@@ -100,6 +100,22 @@ def with_history(env: gym.Env, length: int) -> gym.Env:
     return History(env, length, actions=is_vector and isinstance(env.action_space, spaces.Box))
 
 
+def entries_of_floats(env: VecEnv) -> list[str]:
+    """
+    List the entries that can be normalised.
+
+    :param env: vectorised environments with Dict observations
+    :return: names of the entries of floating-point numbers; images and discrete values are none
+    :raises ValueError: if there are none
+    """
+    assert isinstance(env.observation_space, spaces.Dict)
+    boxes = {key: space for key, space in env.observation_space.items() if isinstance(space, spaces.Box)}
+    found = [key for key, box in boxes.items() if np.issubdtype(box.dtype, np.floating)]
+    if not found:
+        raise ValueError("--normalize: no entry of the observations holds floating-point numbers: leave it out.")
+    return found
+
+
 def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = True) -> VecEnv:
     """
     Normalise observations.

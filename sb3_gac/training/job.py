@@ -33,7 +33,7 @@ from sb3_gac.training.directory import (
     write_at_once,
     write_configuration,
 )
-from sb3_gac.training.environments import STATISTICS, find_modules_here, make_envs, normalized
+from sb3_gac.training.environments import STATISTICS, entries_of_floats, find_modules_here, make_envs, normalized
 from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, evaluate, untrained_policies
 from sb3_gac.training.options import EPISODES_ON_THE_WAY, algorithm_arguments
 from sb3_gac.training.progress import Progress
@@ -128,10 +128,13 @@ def open_environments(options: Namespace) -> tuple[VecEnv, VecEnv]:
     """
     find_modules_here()
     made = (options.env_id, options.env_kwargs, options.wrappers)
-    normalization = PRESETS[options.preset].normalization(options.algorithm)
     try:
-        env = normalized(make_envs(*made, options.envs, options.seed), normalization)
-        return env, normalized(make_envs(*made, min(EPISODES_ON_THE_WAY, options.episodes)), normalization, training=False)
+        env = make_envs(*made, options.envs, options.seed)
+        eval_env = make_envs(*made, min(EPISODES_ON_THE_WAY, options.episodes))
+        normalization = PRESETS[options.preset].normalization(options.algorithm)
+        if normalization is None and options.normalize:
+            normalization = {"norm_obs_keys": entries_of_floats(env)}
+        return normalized(env, normalization), normalized(eval_env, normalization, training=False)
     except (ImportError, GymnasiumError, TypeError, ValueError) as error:
         raise ValueError(f"{options.env_id}: {error}") from error
 

@@ -26,6 +26,7 @@ DEFAULTS: Mapping[str, Any] = {
     "privileged": "state",
     "algorithm": "gac",
     "overrides": {},
+    "normalize": False,
     "steps": 50_000,
     "seed": 0,
     "compile": "auto",
@@ -126,6 +127,13 @@ def _add_training(group: Any) -> None:
         type=mapping,
         metavar="YAML",
         help='changes to the preset, such as "{gamma: 0.95, learning_rate: 1.0e-3}"; YAML reads 1e-3 as text (default: none)',
+    )
+    group.add_argument(
+        "--normalize",
+        action="store_true",
+        default=None,
+        help="bring each number of the observations to mean 0 and standard deviation 1, by SB3's VecNormalize, whose "
+        "statistics are saved beside the model (default: as the preset does; paper-brax alone does)",
     )
     group.add_argument(
         "--compile",
