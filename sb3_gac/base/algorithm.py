@@ -110,6 +110,7 @@ class AsymmetricAlgorithm(
             self.check_can_compile()
         self.make_schedules()
         self.coefficients = self.make_coefficients()
+        self._check_coefficients()
         self._keep_coefficients()
         self.programs = {}
         self._behaviour_state: BehaviourState = None
@@ -171,6 +172,9 @@ class AsymmetricAlgorithm(
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The algorithm's coefficients: name -> coefficient, whose value multiplies a term of a loss."""
         return {}
+
+    def _check_coefficients(self) -> None:
+        """Check, once there are coefficients, arguments that go with them."""
 
     def _keep_coefficients(self) -> None:
         """Keep each coefficient as the attribute whose name files use."""

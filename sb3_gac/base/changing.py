@@ -25,6 +25,7 @@ class ChangingArguments(BaseAlgorithm):
     make_coefficients: Callable[[], dict[str, Coefficient]]
     _all_policy_kwargs: Callable[[], dict[str, Any]]
     _check_arguments: Callable[[], None]
+    _check_coefficients: Callable[[], None]
     _keep_coefficients: Callable[[], None]
     #: Name -> value of all arguments that training goes by
     _in_force: dict[str, Any]
@@ -59,6 +60,7 @@ class ChangingArguments(BaseAlgorithm):
             set_arguments(self, given)
             make_arguments_plain(self)
             self._check_arguments()
+            self._check_coefficients()
             check_not_built_in(given, built_of, self._built_of(), of)
         except ValueError:
             set_arguments(self, before)

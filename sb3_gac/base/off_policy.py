@@ -214,11 +214,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
             )
         }
 
-    def _keep_coefficients(self) -> None:
-        self._check_entropy_counts()
-        super()._keep_coefficients()
-
-    def _check_entropy_counts(self) -> None:
+    def _check_coefficients(self) -> None:
         """
         Check that arguments of the entropy term were given only where there is such a term.
 

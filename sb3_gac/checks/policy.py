@@ -67,11 +67,11 @@ def check_replay_buffer_kwargs(buffer_class: type, given: Mapping[str, Any]) -> 
 
     :param buffer_class: class of the replay buffer
     :param given: name -> argument
-    :raises ValueError: naming the first argument that the class does not take, and the one that may be meant
+    :raises TypeError: naming the first argument that the class does not take, and the one that may be meant
     """
     known = constructor_parameters(buffer_class)
     for name in given:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
             hint = f'is "{close[0]}" meant?' if close else f"it takes {', '.join(known[3:])}."
-            raise ValueError(f'replay_buffer_kwargs has "{name}", which is no argument of {buffer_class.__name__}: {hint}')
+            raise TypeError(f'replay_buffer_kwargs has "{name}", which is no argument of {buffer_class.__name__}: {hint}')

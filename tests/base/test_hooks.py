@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricSAC
@@ -202,7 +203,10 @@ def test_a_network_that_rests_is_logged_nevertheless():
             {"lr_scales": {"memory": 0.1}, "policy_kwargs": {"rnn_type": "gru", "optimizer_class": th.optim.SGD}},
             'a learning rate for "memory" goes with torch',
         ),
-        ({"policy_kwargs": {"features_extractor_class": {"lerner": None}}}, "features_extractor_class names unknown roles"),
+        (
+            {"policy_kwargs": {"features_extractor_class": {"lerner": CombinedExtractor}}},
+            "features_extractor_class names unknown roles",
+        ),
     ],
 )
 def test_bad_settings_of_roles_are_named(arguments, message):

@@ -40,8 +40,8 @@ SHARED = {
     ),
     "replay_buffer_class": ([ReplayBuffer, dict, "DictReplayBuffer"], "replay_buffer_class.*DictReplayBuffer"),
     "replay_buffer_kwargs": (
-        [3, ["storage_dtype"], {"storage_dtyp": "float16"}, {"of_nobody": 1}],
-        r"replay_buffer_kwargs( must be a dict or None| has \"(storage_dtyp|of_nobody)\", which is no argument of Com)",
+        [3, ["storage_dtype"]],
+        "replay_buffer_kwargs must be a dict or None",
     ),
     "optimize_memory_usage": (["yes", 2, None], r"optimize_memory_usage must be one of \[False, True\]"),
     "n_steps": ([0, -1, 1.5, "three", None], "n_steps must be an integer >= 1"),

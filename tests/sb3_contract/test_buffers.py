@@ -53,8 +53,15 @@ def test_buffer_of_ones_own_is_sampled(algorithm):
 
 @algorithms("replay")
 def test_unknown_buffer_arguments_are_refused(algorithm):
-    with pytest.raises(TypeError, match="unexpected keyword argument 'wrong_keyword'"):
+    with pytest.raises(TypeError, match=r'has "wrong_keyword", which is no argument of .*: it takes device'):
         make(algorithm, pendulum(), replay_buffer_kwargs={"wrong_keyword": 1})
+
+
+def test_the_buffers_argument_that_may_be_meant_is_named():
+    with pytest.raises(
+        TypeError, match=r'has "storage_dtyp", which is no argument of CompactDict.*: is "storage_dtype" meant'
+    ):
+        make("gac", pendulum(), replay_buffer_kwargs={"storage_dtyp": "float16"})
 
 
 @pytest.mark.parametrize("handle_timeouts", [True, False])
