@@ -555,7 +555,7 @@ def test_every_algorithm_fits_every_preset():
             algorithm_class(env=env, **settings | small)
 
 
-KILLS = 5  # of each program, spread over what it does
+KILLS = 3  # of each program, spread over what it does
 
 
 @pytest.mark.parametrize("program", ["benchmarks.run", "benchmarks.launch"])
