@@ -64,7 +64,7 @@ class AsymmetricAlgorithm(
     #: Arguments whose results are in files: ``load`` and ``resume`` apply them after those results have been restored
     restored_arguments: ClassVar[tuple[str, ...]] = ("lr_scales", "stats_window_size")
     built_in_arguments = (*ResumableAlgorithm.fixed_arguments, "seed")
-    #: Arguments that the policy class alone reads, so that ``policy_kwargs`` may have them too
+    #: Arguments that ``policy_kwargs`` may have in their place, since the algorithm asks the policy, or both places, for them
     policy_arguments: ClassVar[tuple[str, ...]] = ("role_keys", "lr_scales")
     #: Arguments that are trained models or their paths, whose policies training asks for actions, see :attr:`frozen`
     frozen_arguments: ClassVar[tuple[str, ...]] = ()
@@ -158,7 +158,7 @@ class AsymmetricAlgorithm(
 
     def _all_policy_kwargs(self) -> dict[str, Any]:
         own, given = self._policy_options(), present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")
-        for name in own.keys() & given.keys() - set(self.policy_arguments):
+        for name in sorted(own.keys() & given.keys() - set(self.policy_arguments)):
             raise ValueError(f"policy_kwargs has {name}, which is an argument of {type(self).__name__}: pass it as that.")
         return {**own, **given}
 
