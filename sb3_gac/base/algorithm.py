@@ -18,6 +18,7 @@ from sb3_gac.base.compiling import AUTO, Compilation
 from sb3_gac.base.faults import FaultTolerance
 from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
 from sb3_gac.base.hooks import EpisodeHooks
+from sb3_gac.base.loadable import LoadableAlgorithm
 from sb3_gac.base.overrides import algorithm_of
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.resuming import ResumableAlgorithm
@@ -37,6 +38,7 @@ from sb3_gac.checks.scale import check_same_scale
 from sb3_gac.checks.values import plain
 from sb3_gac.networks.heads import check_action_space
 from sb3_gac.optim.coefficients import Coefficient, DualVariable
+from sb3_gac.optim.compile import Programs
 from sb3_gac.optim.parallel import has_side_effects
 from sb3_gac.replay.source import ReplaySource
 
@@ -46,6 +48,7 @@ class AsymmetricAlgorithm(
     ChangingArguments,
     DeploymentGuard,
     ResumableAlgorithm,
+    LoadableAlgorithm,
     FaultTolerance,
     EpisodeHooks,
     GradientSteps,
@@ -112,7 +115,7 @@ class AsymmetricAlgorithm(
         self.coefficients = self.make_coefficients()
         self._check_coefficients()
         self._keep_coefficients()
-        self.programs = {}
+        self.programs = Programs(self.compiled_settings)
         self._behaviour_state: BehaviourState = None
         self.frozen = {}
         if self.env is not None:  # a model without environments only acts, which takes no teacher
@@ -312,7 +315,7 @@ class AsymmetricAlgorithm(
 
     def _excluded_save_params(self) -> list[str]:
         coefficients = [f"{name}_dual" for name in self.coefficients]
-        others = ["coefficients", "programs", "_program_key", "_worker", "frozen"]
+        others = ["coefficients", "programs", "_worker", "frozen"]
         others += [name for name in self.frozen_arguments if not isinstance(getattr(self, name), (str, PathLike))]
         return [*super()._excluded_save_params(), *coefficients, *others]
 

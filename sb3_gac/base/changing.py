@@ -9,6 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_gac.checks.arguments import KEPT_AS, constructor_arguments, make_arguments_plain
 from sb3_gac.optim.coefficients import Coefficient, LearnedCoefficient
+from sb3_gac.optim.compile import Programs
 
 
 class ChangingArguments(BaseAlgorithm):
@@ -21,7 +22,7 @@ class ChangingArguments(BaseAlgorithm):
     #: Arguments that networks and data are built of, beside those of the policy class; they can't change
     built_in_arguments: ClassVar[tuple[str, ...]] = ()
     coefficients: dict[str, Coefficient]
-    programs: dict[Any, Any]
+    programs: Programs
     make_coefficients: Callable[[], dict[str, Coefficient]]
     _all_policy_kwargs: Callable[[], dict[str, Any]]
     _check_arguments: Callable[[], None]

@@ -2,12 +2,11 @@
 
 import warnings
 from abc import abstractmethod
-from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_gac.base.policy import AsymmetricPolicy
-from sb3_gac.optim.compile import PAYS_FROM, CannotCompileError, check_can_compile, missing_compiler
+from sb3_gac.optim.compile import PAYS_FROM, CannotCompileError, Programs, check_can_compile, missing_compiler
 from sb3_gac.optim.parallel import has_side_effects
 
 AUTO = "auto"
@@ -22,7 +21,7 @@ class Compilation(BaseAlgorithm):
 
     compile: bool | str
     policy: AsymmetricPolicy
-    programs: dict[Any, Any]
+    programs: Programs
     #: The decision of the last ``learn`` and its reason, as a sentence; empty unless ``compile`` is "auto"
     compile_decision: str = ""
     _compiles_on_auto = False

@@ -296,7 +296,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
                 follow_now = targets_follow and (self._n_updates + 1) % self.target_update_interval == 0
                 if self.compiles:  # the update of targets as well
                     step = self._update_with_targets if follow_now else self.update
-                    history.append(self._compiled(step.__name__, step, batch))
+                    history.append(self.compiled(step, batch))
                 else:
                     history.append(self.update(batch))
                     if follow_now:

@@ -158,7 +158,7 @@ class AsymmetricOnPolicyAlgorithm(AsymmetricAlgorithm, RolloutCollection):  # ty
         self.follow_arguments()
         with self.gradient_steps_under_way() as history:
             for batch in self._minibatches():
-                history.append(self._compiled("update", self.update, batch) if self.compiles else self.update(batch))
+                history.append(self.compiled(self.update, batch) if self.compiles else self.update(batch))
             self._n_updates += self.n_epochs
         buffer = self.rollout_buffer
         explained = explained_variance(buffer.values.flatten(), buffer.returns.flatten())

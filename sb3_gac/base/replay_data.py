@@ -9,9 +9,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_gac.base.faults import check_same_spaces_as
 from sb3_gac.checkpoint.rows import SavedBlocks, read_rows, write_rows
 from sb3_gac.checks.policy import check_replay_buffer_kwargs
+from sb3_gac.checks.spaces import check_spaces_of
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.episodes import EpisodeReplayBuffer, check_learns_from_sequences
 from sb3_gac.replay.histories import check_samples_histories
@@ -103,7 +103,7 @@ class ReplayData(OffPolicyAlgorithm):
         finally:
             loaded, self.replay_buffer = self.replay_buffer, before
         assert loaded is not None
-        check_same_spaces_as(self, loaded, "replay buffer")
+        check_spaces_of(self, loaded, "replay buffer")
         self.check_samples_from(type(loaded))
         if self.env is not None:
             check_number(loaded, self.n_envs)

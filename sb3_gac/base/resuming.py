@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
 from sb3_gac.base.arguments import present_names
-from sb3_gac.base.faults import networks_named
+from sb3_gac.base.loadable import networks_named
 from sb3_gac.base.overrides import SETTINGS, check_names, check_unchanged
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checkpoint.files import CheckpointError, checksum, latest_whole, write_checkpoint

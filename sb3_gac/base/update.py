@@ -1,6 +1,5 @@
 """The parts of a gradient step: the primitive ``minimize``, compiled programs, and the logging of metrics."""
 
-import warnings
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,11 +17,8 @@ from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.divergence import check_finite_metrics
 from sb3_gac.math.losses import critic_loss, masked_mean
 from sb3_gac.optim.coefficients import Coefficient
-from sb3_gac.optim.compile import Program
+from sb3_gac.optim.compile import Programs
 from sb3_gac.optim.parallel import Worker, worker
-
-#: Number of programs of one function, for different settings, after which a warning is given
-MANY_PROGRAMS = 3
 
 
 class GradientSteps(BaseAlgorithm):
@@ -40,7 +36,7 @@ class GradientSteps(BaseAlgorithm):
     coefficients: dict[str, Coefficient]
     max_grad_norm: float | None
     mixed_precision: bool
-    programs: dict[Any, Program]
+    programs: Programs
     #: The argument ``compile``, and what :class:`sb3_gac.base.compiling.Compilation` has decided
     compile: bool | str
     compiles: bool
@@ -50,7 +46,6 @@ class GradientSteps(BaseAlgorithm):
     _branches_are_independent: bool
     #: Thread that takes the steps of :attr:`AsymmetricPolicy.side_branch`, in a round in which branches run at once
     _worker: Worker | None = None
-    _program_key: tuple[Any, ...] = ()
     #: Networks that the gradient step under way leaves as they are, see ``update_every``
     _resting: frozenset[str] = frozenset()
     #: Metrics of the last round of gradient steps, all finite
@@ -159,7 +154,7 @@ class GradientSteps(BaseAlgorithm):
         self.policy.refresh_parameters(self.compiles)
         self.refresh_schedules()
         settings = (getattr(self, name) for name in self.compiled_settings)
-        self._program_key = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
+        self.programs.settings = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
         history: list[Metrics] = []
         try:
             in_branches = self._branches_are_independent and not self.compiles and th.get_num_threads() > 1
@@ -169,36 +164,16 @@ class GradientSteps(BaseAlgorithm):
             self._worker = None
         self._record_metrics(history)
 
-    def _compiled(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
+    def compiled(self, step: Callable[..., Metrics], batch: Any) -> Metrics:
         """
-        Call a function by its compiled program, of which there is one for each combination of all that it depends on.
+        Call a gradient step by its compiled program.
 
-        :param name: name of the function
-        :param function: function of tensors, which may also depend on those attributes of this object that are in the key
-        :param args: arguments of the function
-        :return: value of the function
+        :param step: function of tensors, which may also depend on the policy and on :attr:`compiled_settings`
+        :param batch: batch of transitions
+        :return: metrics of the step
         """
-        key = (name, self._resting, *self._program_key, *_layout(args))
-        if key not in self.programs:
-            self._warn_of_many_programs(name)
-            when_it_fails = self._compiling_failed if self.compile == AUTO else None
-            self.programs[key] = Program(function, self.device, when_it_fails)
-        return self.programs[key](*args)
-
-    def _warn_of_many_programs(self, name: str) -> None:
-        """
-        Warn when a setting that is a constant of programs keeps changing.
-
-        :param name: name of the function that is about to be compiled once more
-        """
-        settings = {key[2 : 2 + len(self._program_key)] for key in self.programs if key[0] == name}
-        if len(settings) == MANY_PROGRAMS and self._program_key not in settings:
-            warnings.warn(
-                f"Gradient steps are compiled for the {MANY_PROGRAMS + 1}th time, since the number of threads has changed, or "
-                f"one of {', '.join(self.compiled_settings)}. Each new value takes half a minute: keep to a few values, or "
-                "set compile=False.",
-                stacklevel=2,
-            )
+        when_it_fails = self._compiling_failed if self.compile == AUTO else None
+        return self.programs.run(step, batch, variant=self._resting, device=self.device, when_it_fails=when_it_fails)
 
     def _precision(self) -> AbstractContextManager:
         if self.mixed_precision:
@@ -278,16 +253,3 @@ def _is_on_host(tensor: th.Tensor) -> bool:
         clipped
     """
     return tensor.device.type == "cpu"
-
-
-def _layout(value: Any) -> Iterator[Any]:
-    """Shapes and types of the tensors in tuples, lists and dicts."""
-    if isinstance(value, th.Tensor):
-        yield value.shape, value.dtype
-    elif isinstance(value, dict):
-        for key, part in value.items():
-            yield key
-            yield from _layout(part)
-    elif value is not None:
-        for part in value:
-            yield from _layout(part)

@@ -2,7 +2,7 @@
 Observation entries: the spaces that they may have, the rows that they come in, and the numbers that encoders get.
 
 All code that depends on the kind of an entry's space (Box, Discrete, MultiDiscrete or MultiBinary) is here, except for the
-range of its values, :func:`sb3_gac.checks.values.index_bounds`.
+range of its values, :func:`sb3_gac.checks.spaces.index_bounds`.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space
 from stable_baselines3.common.vec_env import VecTransposeImage
 
-from sb3_gac.checks.values import held_by, index_bounds, is_finite
+from sb3_gac.checks.spaces import held_by, index_bounds, is_finite
 
 #: Types that torch computes little with -> types that hold all their values (those of uint64 rounded, as for networks anyway)
 COMPUTABLE = {"uint16": "int32", "uint32": "int64", "uint64": "float64"}

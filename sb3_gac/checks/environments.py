@@ -19,8 +19,9 @@ from sb3_gac.checks.observations import (
     entries_in,
 )
 from sb3_gac.checks.processes import KEPT, WatchedPipe, end_processes
+from sb3_gac.checks.spaces import entries_of
 from sb3_gac.checks.uses import FINAL, EnvironmentUse, KeepingFinal, SuspiciousEnds
-from sb3_gac.checks.values import described, entries_of
+from sb3_gac.checks.values import described
 
 GUARD = "_environment_guard"
 TRUNCATED = "TimeLimit.truncated"  # SB3's name of an end by time limit in an info

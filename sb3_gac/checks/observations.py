@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from sb3_gac.checks.values import entries_of, fault_of, index_bounds, is_finite
+from sb3_gac.checks.spaces import entries_of, fault_of, index_bounds, is_finite
 
 GO_ON = "learn(..., reset_num_timesteps=False) goes on from a reset environment"
 

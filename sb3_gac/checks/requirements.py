@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gac.checks.entries import check_entries, stored_shape
-from sb3_gac.checks.values import check_box_actions
+from sb3_gac.checks.spaces import check_box_actions
 
 _, DESIRED_GOAL = GOALS = ("achieved_goal", "desired_goal")
 REWARDS_OF_GOALS = (

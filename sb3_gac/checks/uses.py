@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_gac.checks.values import entries_of
+from sb3_gac.checks.spaces import entries_of
 
 FINAL = "terminal_observation"  # SB3's name of an episode's last observation in an info
 USE = "_sb3_gac_use"

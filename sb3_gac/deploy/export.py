@@ -19,7 +19,8 @@ from torch import nn
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.checks.entries import computable
 from sb3_gac.checks.scale import entries_normalised_in_training
-from sb3_gac.checks.values import check_integer, index_bounds
+from sb3_gac.checks.spaces import index_bounds
+from sb3_gac.checks.values import check_integer
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 from sb3_gac.deploy.verification import check_agreement, draw_observations
 from sb3_gac.envs.suites.extras import missing_extra

@@ -14,7 +14,8 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
-from sb3_gac.checks.values import UnsupportedActionSpaceError, check_box_actions, check_positive, check_range
+from sb3_gac.checks.spaces import UnsupportedActionSpaceError, check_box_actions
+from sb3_gac.checks.values import check_positive, check_range
 from sb3_gac.math.distributions import Categorical, TanhGaussian
 from sb3_gac.math.losses import log_std_loss
 from sb3_gac.networks.layers import Head

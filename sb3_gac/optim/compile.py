@@ -9,7 +9,8 @@ import os
 import shutil
 import sys
 import sysconfig
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
@@ -20,6 +21,8 @@ import torch as th
 
 #: Number of gradient steps from which compilation saves more than the half minute that it takes
 PAYS_FROM = 10_000
+#: Number of programs of one function, for different settings, after which a warning is given
+MANY_PROGRAMS = 3
 _OPTIONS = {"cpu": {"cpp_wrapper": True}}
 _compiling = Lock()  # held while the compiler works, see is_compiling()
 
@@ -127,6 +130,72 @@ class Program:
                 result = self._run(*args)
         self._is_ready = True
         return result
+
+
+class Programs(dict[tuple[Any, ...], Program]):
+    """
+    Programs of functions, one for each combination of all that a function depends on: (name, settings, variant, layout).
+
+    :param setting_names: names of those settings that a user may change, for a warning where they keep changing
+    """
+
+    def __init__(self, setting_names: Sequence[str]):
+        super().__init__()
+        self.setting_names = setting_names
+        #: Present values of what all functions depend on, beside their arguments
+        self.settings: tuple[Any, ...] = ()
+
+    def run(
+        self,
+        function: Callable[..., Any],
+        *args: Any,
+        device: th.device,
+        variant: Hashable = None,
+        when_it_fails: Callable[[Exception], None] | None = None,
+    ) -> Any:
+        """
+        Call a function by its program, which is compiled first if there is none.
+
+        :param function: function of tensors, see :class:`Program`, that has a name of its own
+        :param args: arguments of the function
+        :param device: device that the function runs on
+        :param variant: what this function depends on, beside its arguments and :attr:`settings`
+        :param when_it_fails: callback that gets the error if compiling fails, see :class:`Program`; ``None`` raises the error
+        :return: value of the function
+        """
+        key = (function.__name__, self.settings, variant, tuple(_layout(args)))
+        if key not in self:
+            self._warn_of_many(function.__name__)
+            self[key] = Program(function, device, when_it_fails)
+        return self[key](*args)
+
+    def _warn_of_many(self, name: str) -> None:
+        """
+        Warn when settings keep changing.
+
+        :param name: name of the function that is about to be compiled once more
+        """
+        compiled_for = {settings for function, settings, *_ in self if function == name}
+        if len(compiled_for) == MANY_PROGRAMS and self.settings not in compiled_for:
+            warnings.warn(
+                f"Gradient steps are compiled for the {MANY_PROGRAMS + 1}th time, since the number of threads has changed, or "
+                f"one of {', '.join(self.setting_names)}. Each new value takes half a minute: keep to a few values, or "
+                "set compile=False.",
+                stacklevel=2,
+            )
+
+
+def _layout(value: Any) -> Iterator[Any]:
+    """Shapes and types of the tensors in tuples, lists and dicts."""
+    if isinstance(value, th.Tensor):
+        yield value.shape, value.dtype
+    elif isinstance(value, dict):
+        for key, part in value.items():
+            yield key
+            yield from _layout(part)
+    elif value is not None:
+        for part in value:
+            yield from _layout(part)
 
 
 def _with_own_code(function: Callable[..., Any]) -> FunctionType:

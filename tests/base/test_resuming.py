@@ -143,7 +143,6 @@ OF_RESUMING = {
     "_resumed_noise",
     "resumed_notes",
     "learn_scope",
-    "_program_key",
     "chooses_behaviour",
     "frozen",
 }

@@ -5,7 +5,6 @@ import pytest
 import torch as th
 
 from sb3_gac import GAC, AsymmetricMPO, AsymmetricSAC, GACShare, GACWithoutQ
-from sb3_gac.base import update
 from tests.helpers import TwoViewBandit, small_model
 
 
@@ -101,7 +100,7 @@ class Uncompiled:
 @pytest.fixture
 def compiled(monkeypatch):
     """A model of AsymmetricSAC that keeps programs as it does where it compiles."""
-    monkeypatch.setattr(update, "Program", Uncompiled)
+    monkeypatch.setattr("sb3_gac.optim.compile.Program", Uncompiled)
     return _model(AsymmetricSAC, compile=True, policy_delay=2)
 
 

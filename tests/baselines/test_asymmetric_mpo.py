@@ -318,7 +318,7 @@ def test_a_number_that_is_compiled_in_has_a_program_of_its_own(setting):
     for value in (3, 5):
         setattr(model, setting, value)
         model.train(1, 8)
-        keys.append(model._program_key)
+        keys.append(model.programs.settings)
     assert keys[0] != keys[1]
 
 
