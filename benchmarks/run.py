@@ -30,8 +30,9 @@ from benchmarks.program import read_rows, rows_as_text
 from benchmarks.suite import RUNS, UNSAID, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.base.recording import holds_every_step
 from sb3_gac.checkpoint.lock import locked
+from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.presets import instantiate
-from sb3_gac.training.environments import STATISTICS, normalized
+from sb3_gac.training.environments import normalized
 from sb3_gac.training.provenance import provenance
 
 CONFIGURATION, MODEL = "config.yaml", "model.zip"

@@ -19,7 +19,7 @@ ROOMS = {
     "replay": "replay|checks",
     "checkpoint": "checkpoint|envs",
     "base": "algorithms|base|math|checks|schedules|optim|networks|replay|checkpoint|envs",
-    "deploy": "deploy|base|checks|networks|envs|learner|version|stopping|training\\.environments",
+    "deploy": "deploy|base|checks|networks|envs|learner|version|stopping",
     "evaluation": "evaluation|algorithms|base|envs|learner|training\\.environments",
 }
 DRAWING = "page|intervals|bootstrap|tidy"

@@ -70,21 +70,22 @@ class SharedGuider(RoleModel):
     :param features_extractor: encoder of the entries that the learner does not see; ``None`` if it sees all of them
     """
 
-    rest_extractor = memory = None
-
     def __init__(
         self, learner: SharedLearner, observation_space: spaces.Dict, features_extractor: BaseFeaturesExtractor | None
     ):
         super().__init__(
             observation_space,
             learner.action_space,
-            features_extractor=features_extractor,
-            normalize_images=learner.normalize_images,
+            learner.net_arch,
+            features_extractor,
+            0 if features_extractor is None else features_extractor.features_dim,
+            learner.activation_fn,
+            learner.normalize_images,
         )
         self._learner = (learner,)  # in a tuple, so that the learner's parameters do not count as the guider's
         self.privileged: nn.Module | None = None
         if features_extractor is not None:
-            self.privileged = nn.Linear(features_extractor.features_dim, learner.net_arch[0], bias=False)
+            self.privileged = nn.Linear(self.features_dim, learner.net_arch[0], bias=False)
 
     def distribution(self, obs: PyTorchObs) -> Distribution:
         """The guider's action distribution, see :meth:`RolePolicy.distribution`."""

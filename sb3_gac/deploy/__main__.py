@@ -13,9 +13,9 @@ from pathlib import Path
 
 from sb3_gac.base.loading import load_model, model_file
 from sb3_gac.deploy.export import WRITERS, export_learner
+from sb3_gac.deploy.statistics import STATISTICS, normalizer_of
 from sb3_gac.deploy.verification import ExportError
 from sb3_gac.stopping import StoppedInALine
-from sb3_gac.training.environments import STATISTICS, normalizer_of
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

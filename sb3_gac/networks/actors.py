@@ -7,14 +7,13 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_gac.checks.entries import ObservationReader, check_is_observation
 from sb3_gac.math.distributions import Distribution
 from sb3_gac.networks.heads import LOG_STD_BOUNDS, make_head
-from sb3_gac.networks.recurrent import Memory
 from sb3_gac.networks.role_model import RoleModel
 
 
@@ -36,22 +35,13 @@ class RolePolicy(RoleModel, BoundedPolicy):
     """
     A policy network on the entries of its role: encoder, hidden layers, and the head that fits the actions.
 
-    :param observation_space: space of the entries that this role reads
-    :param action_space: Box or Discrete space of actions
-    :param net_arch: hidden layer sizes
-    :param features_extractor: encoder of the entries
-    :param features_dim: number of features that go into the hidden layers
-    :param activation_fn: activation after each hidden layer
-    :param normalize_images: whether images are divided by 255
-    :param rest_extractor: encoder of the entries that the deployed policy does not read, if ``features_extractor`` is the
-        deployed policy's and this network is another role's; else ``None``
+    Further arguments are those of :class:`RoleModel`, where ``action_space`` is a Box or Discrete.
+
     :param log_std_bounds: smallest and largest log standard deviation before tanh
     :param softplus_min_std: smallest standard deviation of a head with softplus, see :func:`sb3_gac.networks.heads.make_head`;
         ``None`` for a head with exp
-    :param memory: memory between encoder and hidden layers; ``features_dim`` is then its output size. ``None`` for none
     """
 
-    features_extractor: BaseFeaturesExtractor
     head: Any  # GaussianHead or CategoricalHead, which nn.Module hides from type checkers
 
     def __init__(
@@ -59,32 +49,18 @@ class RolePolicy(RoleModel, BoundedPolicy):
         observation_space: spaces.Dict,
         action_space: spaces.Space,
         net_arch: list[int],
-        features_extractor: BaseFeaturesExtractor,
-        features_dim: int,
-        activation_fn: type[nn.Module] = nn.SiLU,
-        normalize_images: bool = True,
-        rest_extractor: BaseFeaturesExtractor | None = None,
+        *args: Any,
         log_std_bounds: tuple[float, float] = LOG_STD_BOUNDS,
-        memory: Memory | None = None,
         softplus_min_std: float | None = None,
+        **kwargs: Any,
     ):
-        super().__init__(
-            observation_space,
-            action_space,
-            features_extractor=features_extractor,
-            normalize_images=normalize_images,
-            squash_output=isinstance(action_space, spaces.Box),
-        )
+        squashes = isinstance(action_space, spaces.Box)
+        super().__init__(observation_space, action_space, net_arch, *args, squash_output=squashes, **kwargs)
         self.reader = ObservationReader(observation_space)
-        self.rest_extractor = rest_extractor
-        self.memory = memory
-        self.net_arch = net_arch
-        self.features_dim = features_dim
-        self.activation_fn = activation_fn
         self.log_std_bounds = log_std_bounds
         self.softplus_min_std = softplus_min_std
-        self.latent_net = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
-        latent_dim = net_arch[-1] if net_arch else features_dim
+        self.latent_net = nn.Sequential(*create_mlp(self.features_dim, -1, net_arch, self.activation_fn))
+        latent_dim = net_arch[-1] if net_arch else self.features_dim
         self.head = make_head(latent_dim, action_space, log_std_bounds, softplus_min_std)
 
     def forward(self, obs: PyTorchObs) -> Distribution:
@@ -155,14 +131,8 @@ class RolePolicy(RoleModel, BoundedPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {
-            "net_arch": self.net_arch,
-            "features_extractor": self.features_extractor,
-            "features_dim": self.features_dim,
-            "activation_fn": self.activation_fn,
-            "rest_extractor": self.rest_extractor,
             "log_std_bounds": self.log_std_bounds,
             "softplus_min_std": self.softplus_min_std,
-            "memory": self.memory,
         }
 
 

@@ -4,14 +4,11 @@ import itertools
 from typing import Any
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_gac.networks.layers import EnsembleHead, EnsembleInput, EnsembleLinear, EnsembleOutput
-from sb3_gac.networks.recurrent import Memory
 from sb3_gac.networks.role_model import RoleModel
 
 
@@ -19,57 +16,27 @@ class CriticEnsemble(RoleModel):
     """
     An ensemble of Q-networks on the entries of one role, which value given actions and are evaluated together.
 
-    :param observation_space: space of the entries that this role reads
-    :param action_space: Box of A dimensions
-    :param net_arch: hidden layer sizes
-    :param features_extractor: encoder of the entries
-    :param features_dim: number of features that go into the hidden layers, F
-    :param activation_fn: activation after each hidden layer
-    :param normalize_images: whether images are divided by 255
-    :param rest_extractor: encoder of the entries that the deployed policy does not read, if ``features_extractor`` is the
-        deployed policy's; else ``None``
+    Further arguments are those of :class:`RoleModel`, where ``action_space`` is a Box of A dimensions.
+
     :param n_critics: size of the ensemble, N
-    :param memory: memory between the encoder and the layers that actions go into; ``features_dim`` is then its output size.
-        ``None`` for none
     """
 
-    features_extractor: BaseFeaturesExtractor
-
-    def __init__(
-        self,
-        observation_space: spaces.Dict,
-        action_space: spaces.Space,
-        net_arch: list[int],
-        features_extractor: BaseFeaturesExtractor,
-        features_dim: int,
-        activation_fn: type[nn.Module] = nn.SiLU,
-        normalize_images: bool = True,
-        rest_extractor: BaseFeaturesExtractor | None = None,
-        n_critics: int = 2,
-        memory: Memory | None = None,
-    ):
-        super().__init__(
-            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
-        )
-        self.rest_extractor = rest_extractor
-        self.memory = memory
-        self.net_arch = net_arch
-        self.features_dim = features_dim
-        self.activation_fn = activation_fn
+    def __init__(self, *args: Any, n_critics: int = 2, **kwargs: Any):
+        super().__init__(*args, **kwargs)
         self.n_critics = n_critics
-        layers = [activation_fn()] if net_arch else []
-        for in_features, out_features in itertools.pairwise(net_arch):
-            layers += [EnsembleLinear(n_critics, in_features, out_features), activation_fn()]
+        layers = [self.activation_fn()] if self.net_arch else []
+        for in_features, out_features in itertools.pairwise(self.net_arch):
+            layers += [EnsembleLinear(n_critics, in_features, out_features), self.activation_fn()]
         self.hidden = nn.Sequential(*layers)
-        self._make_ends(features_dim)
+        self._make_ends()
 
-    def _make_ends(self, features_dim: int) -> None:
+    def _make_ends(self) -> None:
         """Build the first and the last layer."""
         action_dim = get_action_dim(self.action_space)
         self.input: nn.Module | None = None
         if self.net_arch:
-            self.input = EnsembleInput(self.n_critics, features_dim, action_dim, self.net_arch[0])
-        self.output: nn.Module = EnsembleOutput(self.n_critics, [features_dim + action_dim, *self.net_arch][-1])
+            self.input = EnsembleInput(self.n_critics, self.features_dim, action_dim, self.net_arch[0])
+        self.output: nn.Module = EnsembleOutput(self.n_critics, [self.features_dim + action_dim, *self.net_arch][-1])
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor | None) -> th.Tensor:
         r"""
@@ -121,15 +88,7 @@ class CriticEnsemble(RoleModel):
         return q if actions.dim() == 2 else q.unflatten(1, actions.shape[:2])
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | {
-            "net_arch": self.net_arch,
-            "features_extractor": self.features_extractor,
-            "features_dim": self.features_dim,
-            "activation_fn": self.activation_fn,
-            "rest_extractor": self.rest_extractor,
-            "n_critics": self.n_critics,
-            "memory": self.memory,
-        }
+        return super()._get_constructor_parameters() | {"n_critics": self.n_critics}
 
 
 class DiscreteCriticEnsemble(CriticEnsemble):
@@ -139,10 +98,10 @@ class DiscreteCriticEnsemble(CriticEnsemble):
     Arguments are those of :class:`CriticEnsemble`, except that ``action_space`` is a Discrete space of A actions.
     """
 
-    def _make_ends(self, features_dim: int) -> None:
+    def _make_ends(self) -> None:
         n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
-        widths = [features_dim, *self.net_arch]
-        self.input = EnsembleLinear(self.n_critics, features_dim, widths[1]) if self.net_arch else None
+        widths = [self.features_dim, *self.net_arch]
+        self.input = EnsembleLinear(self.n_critics, *widths[:2]) if self.net_arch else None
         self.output = EnsembleHead(self.n_critics, widths[-1], n_actions)
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor | None = None) -> th.Tensor:

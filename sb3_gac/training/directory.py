@@ -14,10 +14,10 @@ import yaml
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.checkpoint.files import checkpoints, step_of
 from sb3_gac.checks.arguments import KEPT_AS, constructor_arguments
+from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.envs import PARTIAL
 from sb3_gac.envs.suites import SUITES, suite_of
 from sb3_gac.stopping import command
-from sb3_gac.training.environments import STATISTICS
 from sb3_gac.training.evaluation import EVAL_SEED
 from sb3_gac.training.options import DEFAULTS, name_of_run, noise_in_words, resolve
 from sb3_gac.training.provenance import provenance

@@ -18,6 +18,7 @@ from sb3_gac import ExactCheckpointCallback, GuiderLearnerEvalCallback, SeededEv
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.checkpoint.files import checkpoints
 from sb3_gac.checkpoint.lock import locked
+from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.presets import PRESETS
 from sb3_gac.stopping import when_stopped_say
 from sb3_gac.training.curve import draw_learning_curve
@@ -33,7 +34,7 @@ from sb3_gac.training.directory import (
     write_at_once,
     write_configuration,
 )
-from sb3_gac.training.environments import STATISTICS, entries_of_floats, find_modules_here, make_envs, normalized
+from sb3_gac.training.environments import entries_of_floats, find_modules_here, make_envs, normalized
 from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, evaluate, untrained_policies
 from sb3_gac.training.options import EPISODES_ON_THE_WAY, algorithm_arguments
 from sb3_gac.training.progress import Progress
