@@ -39,11 +39,12 @@ PRESET, N_TIMESTEPS = "small", 100_000
 _NET_ARCHS = {"small": [128, 128], "medium": [256, 256], "large": [400, 300]}
 
 
-def hyperparameters(name: str) -> dict[str, dict[str, Any]]:
+def hyperparameters(name: str, privileged: str | None = None) -> dict[str, dict[str, Any]]:
     """
     The hyperparameters of an algorithm in rl_zoo3's form, from the preset ``small``.
 
     :param name: name of the algorithm
+    :param privileged: value of the environment's argument ``privileged``; ``None`` for its default
     :return: environment id or "default" -> hyperparameters; ``role_keys`` are only in those of registered tasks whose
         privileged entry is the whole state
     """
@@ -53,7 +54,10 @@ def hyperparameters(name: str) -> dict[str, dict[str, Any]]:
         arguments = merge(arguments, layer)
     default = {key: value for key, value in arguments.items() if key != "role_keys"}
     with_whole_state = [
-        env_id for suite in SUITES.values() for env_id in suite.environments if suite.shows_whole_state(env_id)
+        env_id
+        for suite in SUITES.values()
+        for env_id in suite.environments
+        if suite.shows_whole_state(env_id) and privileged in (None, *suite.privileged[:1])
     ]
     return {"default": default, **dict.fromkeys(with_whole_state, arguments)}
 
@@ -214,6 +218,8 @@ def _known(options: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo")
     parser.add_argument("-conf", "--conf-file")
+    parser.add_argument("--env")  # which would be taken for the beginning of the next
+    parser.add_argument("--env-kwargs", nargs="+", action=utils.StoreDict, default={})
     return parser.parse_known_args(list(options))[0]
 
 
@@ -229,7 +235,7 @@ def with_hyperparameters(options: list[str], directory: Path) -> list[str]:
     if known.conf_file is not None or known.algo not in ALGORITHMS:
         return options
     path = directory / f"{known.algo}.yml"
-    path.write_text(yaml.safe_dump(hyperparameters(known.algo), sort_keys=False))
+    path.write_text(yaml.safe_dump(hyperparameters(known.algo, known.env_kwargs.get("privileged")), sort_keys=False))
     return [*options, "--conf-file", str(path)]
 
 

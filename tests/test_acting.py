@@ -60,6 +60,20 @@ def test_noise_is_added_and_clipped(cls):
     np.testing.assert_array_equal([step.action for step in env.steps], [env.action_space.high] * 12)
 
 
+@pytest.mark.parametrize("shape", [(2, 2), (4, 1)])
+@pytest.mark.parametrize("of_noise", ["flat", "in the actions' shape"])
+def test_noise_is_added_to_actions_of_any_shape(shape, of_noise):
+    """Component by component: the first one's noise is far up, the others' far down."""
+    shown = {key: spaces.Box(-1, 1, (2,), np.float32) for key in ("partial", "privileged")}
+    env = Sampled(spaces.Dict(**shown), spaces.Box(-1, 1, shape, np.float32))
+    mean = np.array([9.0, -9, -9, -9])
+    noise = NormalActionNoise(
+        mean if of_noise == "flat" else mean.reshape(shape), np.zeros(4 if of_noise == "flat" else shape)
+    )
+    model = small_model(env, learning_starts=0, action_noise=noise).learn(12)
+    np.testing.assert_array_equal(model.replay_buffer.actions[:12, 0], np.tile([1.0, -1, -1, -1], (12, 1)))
+
+
 @ALGORITHMS
 @pytest.mark.parametrize("discrete", [False, True])
 def test_the_behaviour_policy_explores_unless_it_is_asked_not_to(cls, discrete):

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import pickle
 import re
 import shlex
 import signal
@@ -217,6 +218,19 @@ def test_a_preset_that_normalises_observations_leaves_their_statistics(tmp_path,
     assert model.trained_normalised
     results = json.loads((directory / "results.json").read_text())
     assert results["learner"] == pytest.approx(job.evaluate(DeployedView(model), statistics, 2)[0], rel=1e-3)
+
+
+def test_a_teachers_statistics_are_its_students(tmp_path):
+    """So the teacher sees what it was trained on, whether the student's normalisation was asked for or not."""
+    small = ["--history", "1", "--overrides", "{learning_starts: 50, batch_size: 8, policy_kwargs: {net_arch: [8]}}"]
+    main([*QUICK, *small, "--algorithm", "asymmetric_sac", "--normalize", "--runs", str(tmp_path / "teachers")])
+    (teacher,) = (tmp_path / "teachers").iterdir()
+    main([*QUICK, *small, "--algorithm", "cosil", "--teacher", str(teacher), "--runs", str(tmp_path / "students")])
+    (student,) = (tmp_path / "students").iterdir()
+    shown, seen = (pickle.loads((run / "vecnormalize.pkl").read_bytes()).obs_rms for run in (teacher, student))
+    for key in ("partial", "privileged"):
+        np.testing.assert_array_equal(shown[key].mean, seen[key].mean)
+        assert shown[key].count == seen[key].count > 400
 
 
 def test_observations_are_normalised_on_request(tmp_path):

@@ -110,6 +110,14 @@ def test_our_algorithms_have_our_hyperparameters(algorithm, tmp_path):
         assert yaml.safe_load((tmp_path / f"{algorithm}.yml").read_text()) == hyperparameters(algorithm)
 
 
+def test_critics_see_all_where_the_environments_privileged_entry_is_less_than_the_state(tmp_path):
+    path = tmp_path / "gac.yml"
+    for words, sees_state_alone in ((["privileged:'velocity'"], False), (["noise_std:0.2", "privileged:'state'"], True)):
+        with_hyperparameters(["--algo", "gac", "--env", "sb3_gac/Hopper-v5", "--env-kwargs", *words], tmp_path)
+        written = yaml.safe_load(path.read_text())
+        assert ("role_keys" in written.get("sb3_gac/Hopper-v5", written["default"])) == sees_state_alone
+
+
 @pytest.mark.parametrize(
     "options",
     [

@@ -34,7 +34,7 @@ from sb3_gac.checks.arguments import (
 )
 from sb3_gac.checks.policy import check_policy_kwargs
 from sb3_gac.checks.requirements import warn_of_an_unseen_goal
-from sb3_gac.checks.scale import check_same_scale
+from sb3_gac.checks.scale import check_same_scale, check_same_statistics
 from sb3_gac.checks.values import plain
 from sb3_gac.networks.heads import check_action_space
 from sb3_gac.optim.coefficients import Coefficient, DualVariable
@@ -236,6 +236,9 @@ class AsymmetricAlgorithm(
         # SB3 leaves the end of the last training here until the first step, but the first policies to act are chosen before
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         self._load_frozen(needed=True)
+        if not self._n_updates:  # later the environments' statistics may have moved on
+            for name, teacher in self.frozen.items():
+                check_same_statistics(name, teacher.entries, teacher.scales, self.env)
         self.decide_compilation()
         return result
 
@@ -330,4 +333,4 @@ class AsymmetricAlgorithm(
 
 
 def _check_scale(name: str, teacher: FrozenPolicy, env: Any) -> None:
-    check_same_scale(name, teacher.policy.observation_space.spaces, teacher.normalised, env)  # type: ignore[attr-defined]
+    check_same_scale(name, teacher.entries, teacher.normalised, env)

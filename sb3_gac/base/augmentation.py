@@ -5,7 +5,7 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 
 from sb3_gac.math.images import random_shift
 from sb3_gac.replay.samples import SequenceSamples
@@ -25,6 +25,12 @@ def shifted_entries(space: spaces.Dict, keys: Iterable[str], pixels: int) -> tup
         return ()
     keys = list(keys)
     images = tuple(key for key in keys if is_image_space(space[key], normalized_image=True))
+    channels_last = [key for key in images if not is_image_space_channels_first(space[key])]  # type: ignore[arg-type]
+    if channels_last:  # SB3 brings images of uint8 into this order, and no others
+        raise ValueError(
+            f"random_shift={pixels} needs images with their channels first, and {channels_last} have them last: transpose "
+            "them where they are made, or make them of type uint8."
+        )
     if not images:
         raise ValueError(
             f"random_shift={pixels} shifts images, but the deployed policy reads {keys}, of which none is: leave it 0."

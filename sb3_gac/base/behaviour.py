@@ -14,6 +14,9 @@ from sb3_gac.schedules import as_schedule
 #: collects by default, or of the deployed policy where the former has a share itself
 BehaviourSpec: TypeAlias = str | Mapping[str, float | str | Schedule] | None
 
+#: Fractions of training that remain, at which shares are looked at ahead of training
+MOMENTS = tuple(eighths / 8 for eighths in range(9))
+
 
 class Behaviour:
     """
@@ -25,29 +28,42 @@ class Behaviour:
     :param per: unit of the shares: "episode", where a policy is drawn at each episode's start, or "environment", where each
         policy has a fixed part of the environments
     :param frozen: names of frozen policies, which may act as well
-    :raises ValueError: if a name is no policy's, if shares are not from 0 to 1, or if they sum up to less than 1 and no policy
-        is left for the remainder
+    :param n_envs: number of environments
+    :raises ValueError: if a name is no policy's, if shares are not from 0 to 1, if they sum up to less than 1 and no policy
+        is left for the remainder, or if a policy's part of the environments is none at any time
     """
 
-    def __init__(self, roles: Roles, behaviour: BehaviourSpec, per: str = "episode", frozen: Sequence[str] = ()):
+    def __init__(
+        self, roles: Roles, behaviour: BehaviourSpec, per: str = "episode", frozen: Sequence[str] = (), n_envs: int = 1
+    ):
         self.default = behaviour if isinstance(behaviour, str) else roles.behaviour
         shares = behaviour if isinstance(behaviour, Mapping) else {}
         self.shares: dict[str, Any] = {role: _read_share(role, share) for role, share in shares.items()}
         left = [role for role in (self.default, roles.deployed) if role not in self.shares]
         self.remainder: str | None = left[0] if left else None
         self.per = per
+        self.n_envs = n_envs
         for role in (self.default, *self.shares):
             check_choice("behaviour: a policy", role, (*roles.policies, *frozen))
         self.shares_at(1.0)
+        for role in self.shares if per == "environment" else ():
+            if not self.acts(role) and any(self._share_of(role, moment) > 0 for moment in MOMENTS):
+                raise ValueError(
+                    f"behaviour gives {role} a share that is less than one of {n_envs} environments, so {role} would never "
+                    'act: give more environments or a larger share, or leave behaviour_per "episode".'
+                )
 
     def acts(self, role: str) -> bool:
         """
         Whether a policy ever acts; shares are looked at in nine moments of training, at equal distances.
 
         :param role: role of the policy
-        :return: whether its share is above 0 in one of these moments
+        :return: whether its share is above 0 in one of these moments; where shares are parts of the environments, whether its
+            part is one environment at least
         """
-        return any(self._share_of(role, eighths / 8) > 0 for eighths in range(9))
+        if self.shares and self.per == "environment":
+            return any(role in self._parts(self.shares_at(moment), self.n_envs) for moment in MOMENTS)
+        return any(self._share_of(role, moment) > 0 for moment in MOMENTS)
 
     def _share_of(self, role: str, progress_remaining: float) -> float:
         shares = self.shares_at(progress_remaining)
@@ -80,12 +96,23 @@ class Behaviour:
         if not self.shares or not episode_start.any():
             return list(acting) if self.shares else [self.default] * len(episode_start)
         shares = self.shares_at(progress_remaining)
-        names, limits = list(shares), np.cumsum(list(shares.values()))
         n_envs = len(episode_start)
-        drawn = np.random.rand(n_envs) if self.per == "episode" else (np.arange(n_envs) + 0.5) / n_envs
-        rest = self.remainder or names[-1]  # the last one's limit may be rounded to less than 1
-        chosen = [next((name for name, limit in zip(names, limits, strict=True) if u < limit), rest) for u in drawn]
+        chosen = self._drawn(shares, np.random.rand(n_envs)) if self.per == "episode" else self._parts(shares, n_envs)
         return [new if starts else old for new, old, starts in zip(chosen, acting, episode_start, strict=True)]
+
+    def _parts(self, shares: Mapping[str, float], n_envs: int) -> list[str]:
+        """The policy of each environment, where policies have fixed parts of them."""
+        return self._drawn(shares, (np.arange(n_envs) + 0.5) / n_envs)
+
+    def _drawn(self, shares: Mapping[str, float], numbers: np.ndarray) -> list[str]:
+        """
+        :param shares: role -> share
+        :param numbers: numbers in [0, 1)
+        :return: role of the policy in whose part of [0, 1) each number is
+        """
+        names, limits = list(shares), np.cumsum(list(shares.values()))
+        rest = self.remainder or names[-1]  # the last one's limit may be rounded to less than 1
+        return [next((name for name, limit in zip(names, limits, strict=True) if u < limit), rest) for u in numbers]
 
 
 def _read_share(role: str, share: Any) -> Any:

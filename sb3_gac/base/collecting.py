@@ -15,8 +15,10 @@ from stable_baselines3.common.utils import should_collect_more_steps
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_gac.base.behaviour import Behaviour
 from sb3_gac.base.replay_data import check_number
 from sb3_gac.checks.arguments import check_train_freq
+from sb3_gac.checks.requirements import warn_of_other_rewards
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.source import ReplaySource
 
@@ -39,6 +41,8 @@ class DataCollection(OffPolicyAlgorithm):
     _returns_so_far: Any
     _behaviour_state: Any
     _fit_action_noise: Callable[[], None]
+    _make_behaviour: Callable[[int], Behaviour]
+    chooses_behaviour: Behaviour
     note_use: Callable[[], None]
     call_hooks: Callable[[np.ndarray], None]
     follow_arguments: Callable[[], None]
@@ -63,6 +67,7 @@ class DataCollection(OffPolicyAlgorithm):
             self.replay_buffer = None
         if env.num_envs != self.n_envs:
             check_train_freq("train_freq", self.train_freq, env.num_envs)
+            self.chooses_behaviour = self._make_behaviour(env.num_envs)
             self.n_envs, self._last_obs, self._behaviour_state = env.num_envs, None, None
             self._fit_action_noise()
         super().set_env(env, force_reset)
@@ -183,6 +188,9 @@ class DataCollection(OffPolicyAlgorithm):
                 values[index] = final[key]
         rewards = source.reward(reward)
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, rewards, dones, infos)  # type: ignore[arg-type]
+        if self.num_timesteps == self._num_timesteps_at_start:  # one look is enough
+            assert self.env is not None
+            warn_of_other_rewards(type(replay_buffer), self.replay_buffer_kwargs, self.env, next_obs, rewards, infos)
         self._returns_so_far += rewards
         self._last_obs, self._last_original_obs, self._last_episode_starts = new_obs, following, np.array(dones)
 

@@ -15,7 +15,7 @@ from sb3_gac.base.loading import class_of_model
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.base.random_state import random_numbers_kept
 from sb3_gac.checks.entries import encode, leading_dimensions
-from sb3_gac.checks.scale import entries_normalised_in_training
+from sb3_gac.checks.scale import entries_normalised_in_training, scales_in_training
 from sb3_gac.math.distributions import TanhGaussian
 
 
@@ -36,11 +36,16 @@ class FrozenPolicy(nn.Module):
         if getattr(model, "use_sde", False):
             raise ValueError(f"{name} explores by gSDE, whose distribution is not one of the action alone: train it without.")
         self.policy = deepcopy(model.policy)  # because the model itself may go on training
-        self.normalised = entries_normalised_in_training(model)
+        self.normalised, self.scales = entries_normalised_in_training(model), scales_in_training(model)
         if isinstance(self.policy, AsymmetricPolicy) and (self.policy.remembers or any(self.policy.rnn_types.values())):
             raise ValueError(f"{name} has a memory, but is given single transitions: train a {name} without a memory.")
         self.requires_grad_(False)
         self.train(False)
+
+    @property
+    def entries(self) -> list[str]:
+        """Names of the observation entries that the policy's model was trained on."""
+        return list(self.policy.observation_space.spaces)  # type: ignore[attr-defined]
 
     @th.no_grad()
     def forward(self, obs: PyTorchObs) -> Any:

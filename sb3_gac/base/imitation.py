@@ -25,11 +25,18 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_gac.base.policy import AsymmetricPolicy
-from sb3_gac.checks.scale import check_same_scale, entries_normalised_in_training
+from sb3_gac.checks.scale import (
+    check_same_scale,
+    check_same_statistics,
+    entries_normalised_in_training,
+    scales_in_training,
+)
 from sb3_gac.checks.values import check_integer, check_positive
 from sb3_gac.math.distributions import Categorical
 
 HELD_OUT = 0.1
+#: Attributes of networks that change what they compute with the same parameters
+_SETTINGS = ("activation_fn", "log_std_bounds", "softplus_min_std", "normalize_images")
 
 
 class Demonstrations(NamedTuple):
@@ -101,6 +108,7 @@ def _check_scale(name: str, model: BaseAlgorithm, env: VecEnv, guides: bool = Fa
     if isinstance(policy, AsymmetricPolicy):
         entries = list(policy.role_keys[policy.roles.behaviour] if guides else policy.deployed_entries)
     check_same_scale(name, entries, entries_normalised_in_training(model), env)
+    check_same_statistics(name, entries, scales_in_training(model), env)
 
 
 def clone_behaviour(
@@ -168,18 +176,19 @@ def copy_networks(model: BaseAlgorithm, source: BaseAlgorithm, networks: Mapping
     :param model: model of this package, whose networks are changed
     :param source: model of this package, whose networks have the same sizes and read the same entries
     :param networks: network of ``model`` -> network of ``source``, such as ``{"guider": "actor"}``
-    :raises ValueError: if there is no such network, or its parameters are of other shapes
+    :raises ValueError: if there is no such network, or it would compute something else: its parameters are of other shapes,
+        or it has another activation, other bounds of its standard deviation, or reads other entries
     """
     for name, from_name in networks.items():
         own, other = (_network(one, role) for one, role in ((model, name), (source, from_name)))
-        saved, expected = other.state_dict(), own.state_dict()
-        differ = [key for key in {**expected, **saved} if _shape(saved, key) != _shape(expected, key)]
+        saved, expected = _made_of(other), _made_of(own)
+        differ = [key for key in {**expected, **saved} if saved.get(key, "missing") != expected.get(key, "missing")]
         if differ:
             key = differ[0]
             raise ValueError(
                 f'networks: "{from_name}" of {type(source).__name__} does not fit "{name}" of {type(model).__name__}: {key} '
-                f"is {_shape(saved, key)} there, and {_shape(expected, key)} here. Make both with one net_arch, on the same "
-                "entries."
+                f"is {saved.get(key, 'missing')} there, and {expected.get(key, 'missing')} here. Make both with the same "
+                "policy_kwargs, on the same entries."
             )
     for name, from_name in networks.items():
         parameters = _network(source, from_name).state_dict()
@@ -208,8 +217,11 @@ def _network(model: BaseAlgorithm, name: str) -> nn.Module:
     return network
 
 
-def _shape(state: Mapping[str, th.Tensor], key: str) -> tuple[int, ...] | str:
-    return tuple(state[key].shape) if key in state else "missing"
+def _made_of(network: Any) -> dict[str, Any]:
+    """Name -> shape of each parameter, and name -> value of whatever else tells what the network computes with them."""
+    settings = {name: getattr(network, name) for name in _SETTINGS if hasattr(network, name)}
+    entries = dict(network.observation_space.spaces)
+    return {name: tuple(value.shape) for name, value in network.state_dict().items()} | settings | {"entries": entries}
 
 
 def _as_tensors(policy: AsymmetricPolicy, demonstrations: Demonstrations) -> tuple[dict[str, th.Tensor], th.Tensor]:
@@ -234,17 +246,20 @@ def _as_tensors(policy: AsymmetricPolicy, demonstrations: Demonstrations) -> tup
         index = int(inside.argmin())
         raise ValueError(f"demonstrations: action {index} is {actions[index]}, which is not in {space}.")
     if isinstance(space, spaces.Box):
-        actions = policy.scale_action(actions.reshape(-1, *space.shape)).reshape(count, -1)
+        actions = np.clip(actions.reshape(-1, *space.shape), space.low, space.high)  # rounding may exceed them
+        actions = policy.scale_action(actions).reshape(count, -1)
         return observations, th.as_tensor(actions, dtype=th.float32, device=policy.device)
     return observations, th.as_tensor(actions[:, 0].astype(np.int64), device=policy.device)
 
 
 def _are_in(space: spaces.Space, actions: np.ndarray) -> np.ndarray:
-    """Whether each row of ``actions`` is in the space, shape (N,)."""
+    """Whether each row of ``actions`` is in the space, but for rounding, shape (N,)."""
     if actions.shape[1] != int(np.prod(space.shape or ())):  # 1 for a discrete action
         return np.zeros(len(actions), dtype=bool)
     if isinstance(space, spaces.Box):
-        return np.all((actions >= space.low.ravel()) & (actions <= space.high.ravel()), axis=1)
+        low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
+        rounding = 4 * np.finfo(np.float32).eps * np.maximum(np.abs(low), np.abs(high))  # SB3's scaling leaves the range
+        return np.all((actions >= low - rounding) & (actions <= high + rounding), axis=1)
     assert isinstance(space, spaces.Discrete)
     return np.isin(actions[:, 0], np.arange(space.n))
 

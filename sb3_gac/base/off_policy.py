@@ -178,11 +178,12 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         assert isinstance(self.observation_space, spaces.Dict)
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
         self._check_replay_buffer_kwargs()
-        check_goals(self.replay_buffer_class, self.observation_space, self.env)
-        resolve_update_every(self.policy_class.roles, self.policy_delay, self.update_every)
         roles = self.policy_class.roles
-        seen = resolve_role_keys(self.observation_space, roles, self.role_keys)[roles.deployed]
-        self._shifted_entries = shifted_entries(self.observation_space, seen, self.random_shift)
+        seen = resolve_role_keys(self.observation_space, roles, self.role_keys)
+        others = {role: keys for role, keys in seen.items() if role != roles.deployed}  # which a warning is given for
+        check_goals(self.replay_buffer_class, self.observation_space, self.env, others)
+        resolve_update_every(roles, self.policy_delay, self.update_every)
+        self._shifted_entries = shifted_entries(self.observation_space, seen[roles.deployed], self.random_shift)
         if self.recording is not None and not issubclass(self._present_buffer_class, CompactDictReplayBuffer):
             raise ValueError("recording needs a CompactDictReplayBuffer: leave replay_buffer_class out.")
         self._make_behaviour()
@@ -201,6 +202,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         """See :meth:`AsymmetricAlgorithm.take_effect`; here are behaviour, train_freq and the replay buffer's."""
         super().take_effect(changed)
         self.chooses_behaviour = self._make_behaviour()
+        self._fit_action_noise()
         if "train_freq" in changed:
             self._convert_train_freq()
         if self.replay_buffer is not None:

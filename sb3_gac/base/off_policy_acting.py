@@ -73,11 +73,12 @@ class OffPolicyActing(EpisodeHooks, DataCollection):
         if warms_up:  # by now the policies' memories are up to date
             return super()._sample_action(learning_starts, action_noise, n_envs)
         if action_noise is not None:
-            scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
+            scaled_action = np.clip(scaled_action + np.reshape(action_noise(), scaled_action.shape), -1, 1)
         return self._in_environments_range(scaled_action), scaled_action
 
-    def _make_behaviour(self) -> Behaviour:
-        return Behaviour(self.policy_class.roles, self.behaviour, self.behaviour_per, self.frozen_arguments)
+    def _make_behaviour(self, n_envs: int | None = None) -> Behaviour:
+        roles = self.policy_class.roles
+        return Behaviour(roles, self.behaviour, self.behaviour_per, self.frozen_arguments, n_envs or self.n_envs)
 
     def choose_acting(self, episode_start: np.ndarray) -> list[str]:
         """
@@ -105,12 +106,14 @@ class OffPolicyActing(EpisodeHooks, DataCollection):
         super().call_hooks(dones)
 
     def _fit_action_noise(self) -> None:
-        """Make action noise that SB3 has vectorised fit the present number of environments."""
+        """Make action noise fit the present number of environments, as SB3 does when ``learn`` begins, and not later."""
         noise = self.action_noise
-        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:
-            base = deepcopy(noise.base_noise)
-            base.reset()
-            self.action_noise = VectorizedActionNoise(base, self.n_envs) if self.n_envs > 1 else base
+        is_vectorized = isinstance(noise, VectorizedActionNoise)
+        if noise is None or (noise.n_envs if is_vectorized else 1) == self.n_envs:  # type: ignore[attr-defined]
+            return
+        base = deepcopy(noise.base_noise if is_vectorized else noise)  # type: ignore[attr-defined]
+        base.reset()
+        self.action_noise = VectorizedActionNoise(base, self.n_envs) if self.n_envs > 1 else base
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "chooses_behaviour", "_recorded"]

@@ -59,6 +59,7 @@ class ResumableAlgorithm(BaseAlgorithm):
         "strict_deployment",
         "trained_normalised",
         "normalised_entries",
+        "normalised_scales",
         "_compiles_on_auto",
     )
     #: Arguments that ``resume`` can't change, because the checkpoint's networks and data were made with them

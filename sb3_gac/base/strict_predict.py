@@ -2,13 +2,15 @@
 
 import warnings
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 from sb3_gac.base.policy import AsymmetricPolicy
-from sb3_gac.checks.scale import entries_normalised_by
+from sb3_gac.checks.scale import Scales, entries_normalised_by, inputs_apart, scales_of
 
 
 class DeploymentGuard(BaseAlgorithm):
@@ -30,6 +32,10 @@ class DeploymentGuard(BaseAlgorithm):
     trained_normalised: bool = False
     #: The entries of those observations that it normalised; ``None`` if that is not known, in files of earlier versions
     normalised_entries: tuple[str, ...] | None = None
+    #: Their scales when the model's file was written
+    _saved_scales: Scales = MappingProxyType({})
+    #: ``VecNormalize`` of the last training, whose statistics go on changing; ``None`` for :attr:`_saved_scales`
+    _normaliser: VecNormalize | None = None
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         result = super()._setup_learn(*args, **kwargs)
@@ -42,8 +48,33 @@ class DeploymentGuard(BaseAlgorithm):
                 "VecNormalize.load(<its statistics>, env), or train a new model.",
                 stacklevel=3,
             )
+        elif self._n_updates and (found := inputs_apart(self.normalised_scales, scales_of(self.env), now)):
+            warnings.warn(
+                f'The model has learned from an entry "{found[0]}" that VecNormalize normalised by other statistics: what its '
+                f"networks see is {found[1]:.1f} standard deviations off. Wrap the environments in VecNormalize.load(<the "
+                "statistics that were saved with the model>, env), or train a new model.",
+                stacklevel=3,
+            )
         self.trained_normalised, self.normalised_entries = bool(now), now
+        self._saved_scales, self._normaliser = {}, unwrap_vec_normalize(self.env) if self.env and now else None
         return result
+
+    @property
+    def normalised_scales(self) -> Scales:
+        """Mean and standard deviation of each of :attr:`normalised_entries`, empty if files of earlier versions lack them."""
+        return self._saved_scales if self._normaliser is None else scales_of(self._normaliser)
+
+    @normalised_scales.setter
+    def normalised_scales(self, scales: Scales) -> None:
+        self._saved_scales, self._normaliser = scales, None
+
+    def save(self, *args: Any, **kwargs: Any) -> None:
+        """See SB3's ``save``."""
+        self._saved_scales = dict(self.normalised_scales)
+        super().save(*args, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_normaliser"]
 
     def predict(
         self,

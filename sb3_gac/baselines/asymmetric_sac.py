@@ -77,6 +77,14 @@ class AsymmetricSAC(AsymmetricOffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        self._check_groups()
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if isinstance(getattr(self, "policy", None), AsymmetricSACPolicy):  # not before there is one
+            self._check_groups()
+
+    def _check_groups(self) -> None:
         if self.policy.n_critics % self.critic_groups:
             raise ValueError(
                 f"critic_groups={self.critic_groups} can't be of the same size with {self.policy.n_critics} critics: give "

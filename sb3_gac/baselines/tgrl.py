@@ -182,7 +182,8 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         if self.behaviour is not None:
             return super().choose_acting(episode_start)
         other = {"actor": "auxiliary", "auxiliary": "actor"}
-        return [other[role] if starts else role for role, starts in zip(self.acting, episode_start, strict=True)]
+        # A frozen policy may act until here, where it had a share in ``behaviour`` before
+        return [other.get(role, "actor") if starts else role for role, starts in zip(self.acting, episode_start, strict=True)]
 
     def compare(self, difference: float) -> None:
         """

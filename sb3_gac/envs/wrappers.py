@@ -321,6 +321,11 @@ class PreviousAction(EntryWrapper):
         added = spaces.Box(low, bound, self._nothing.shape, dtype)
         self._set_entry_space(concatenate_boxes([self._entry, added]))
 
+    @property
+    def appends_reward(self) -> bool:
+        """Whether the previous reward is appended as well."""
+        return self._reward
+
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
         return np.concatenate([value, self._nothing], dtype=self._entry.dtype)
 

@@ -48,6 +48,9 @@ def options_of(directory: Path) -> Namespace:
     if "env" in given:
         given.pop("task", None)
     try:
+        made = dict(configuration["environment"]).get("kwargs") or {}
+        if given.get("privileged") != made.get("privileged"):  # earlier versions wrote "state" whatever the task has
+            given.pop("privileged", None)
         return Namespace(**vars(resolve(given)) | {"resume": directory})
     except (TypeError, ValueError) as error:
         raise ValueError(f"--resume {directory}: {CONFIGURATION}: {error}") from error

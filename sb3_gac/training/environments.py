@@ -5,6 +5,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_gac.algorithms import import_path
+from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.envs import PARTIAL, History, make_vec
 from sb3_gac.envs.suites import suite_of
 
@@ -109,7 +111,9 @@ def entries_of_floats(env: VecEnv) -> list[str]:
     return found
 
 
-def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = True) -> VecEnv:
+def normalized(
+    env: VecEnv, options: Mapping[str, Any] | None, training: bool = True, teacher: str | Path | None = None
+) -> VecEnv:
     """
     Normalise observations.
 
@@ -117,8 +121,15 @@ def normalized(env: VecEnv, options: Mapping[str, Any] | None, training: bool = 
     :param options: keyword arguments of ``VecNormalize``, which does not normalise rewards unless they say so; ``None`` for no
         normalisation
     :param training: whether ``VecNormalize`` updates its statistics
+    :param teacher: file of a model that will be asked for actions. If the statistics of its training lie beside it, they are
+        taken in place of ``options``, and stay as they are; ``None`` for no teacher
     :return: environments in a ``VecNormalize``, or as they were
     """
+    statistics = None if teacher is None else Path(teacher).parent / STATISTICS
+    if statistics is not None and statistics.is_file():
+        as_taught = VecNormalize.load(str(statistics), env)
+        as_taught.training, as_taught.norm_reward = False, bool((options or {}).get("norm_reward", False))
+        return as_taught
     return env if options is None else VecNormalize(env, **{"norm_reward": False, "training": training, **options})
 
 

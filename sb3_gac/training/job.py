@@ -135,7 +135,10 @@ def open_environments(options: Namespace) -> tuple[VecEnv, VecEnv]:
         normalization = PRESETS[options.preset].normalization(options.algorithm)
         if normalization is None and options.normalize:
             normalization = {"norm_obs_keys": entries_of_floats(env)}
-        return normalized(env, normalization), normalized(eval_env, normalization, training=False)
+        return (
+            normalized(env, normalization, teacher=options.teacher),
+            normalized(eval_env, normalization, training=False, teacher=options.teacher),
+        )
     except (ImportError, GymnasiumError, TypeError, ValueError) as error:
         raise ValueError(f"{options.env_id}: {error}") from error
 

@@ -23,7 +23,6 @@ DEFAULTS: Mapping[str, Any] = {
     "task": "HalfCheetah",
     "env_kwargs": {},
     "whole_state": False,
-    "privileged": "state",
     "algorithm": "gac",
     "overrides": {},
     "normalize": False,
@@ -91,8 +90,9 @@ def _add_environment(group: Any) -> None:
     )
     group.add_argument(
         "--privileged",
-        choices=["state", "velocity"],
-        help=f"what a task's privileged entry shows (default: {DEFAULTS['privileged']})",
+        choices=sorted({value for suite in SUITES.values() for value in suite.privileged}),
+        help="what a task's privileged entry shows: state or velocity; where sensors are missing rather than noisy, hidden or "
+        "state (default: the first of the two)",
     )
     group.add_argument(
         "--history",
@@ -218,7 +218,8 @@ def resolve(given: Mapping[str, Any]) -> Namespace:
     """
     if "task" in given and "env" in given:
         raise ValueError("--task and --env: give one of them.")
-    options = Namespace(**{**dict.fromkeys(("env", "noise", "history", "envs", "preset", "teacher")), **DEFAULTS, **given})
+    open_ones = dict.fromkeys(("env", "noise", "privileged", "history", "envs", "preset", "teacher"))
+    options = Namespace(**{**open_ones, **DEFAULTS, **given})
     options.env_id = env_id_of(options.task) if options.env is None else registered_id(options.env)
     suite = suite_of(options.env_id)
     if suite is None:
@@ -241,9 +242,15 @@ def _resolve_task(options: Namespace, given: Mapping[str, Any], suite: Suite) ->
             raise ValueError(f"--env-kwargs and --{option} say different things: give one of them.")
         setattr(options, option, value)
     if not suite.sensor_noise:
-        _refuse(options, given, ("noise", "privileged"), f"{options.env_id} has no such argument")
+        _refuse(options, given, ("noise",), f"{options.env_id} has no such argument")
     elif options.noise is None:
         options.noise = suite.noise_std
+    if not suite.privileged:
+        _refuse(options, given, ("privileged",), f"{options.env_id} has no such argument")
+    elif options.privileged is None:
+        options.privileged = suite.privileged[0]
+    elif options.privileged not in suite.privileged:
+        raise ValueError(f"--privileged: {options.env_id} has {' or '.join(suite.privileged)}, got {options.privileged}.")
     _check_noise(options.noise)
     options.preset = options.preset or suite.preset
     if options.history is None:
@@ -253,7 +260,7 @@ def _resolve_task(options: Namespace, given: Mapping[str, Any], suite: Suite) ->
     options.wrappers = []
     options.env_kwargs = {
         **({"noise_std": options.noise} if suite.sensor_noise else {}),
-        **({"privileged": options.privileged} if options.privileged != "state" else {}),  # not every suite has the argument
+        **({"privileged": options.privileged} if options.privileged not in (None, *suite.privileged[:1]) else {}),
         **({"history": options.history} if options.history != 1 else {}),
         **options.env_kwargs,
     }
@@ -334,7 +341,7 @@ def algorithm_arguments(options: Namespace) -> dict[str, Any]:
     if options.teacher is not None:
         own[TEACHER] = str(options.teacher)
     # Without the whole state in one entry, critics need all entries
-    without_state = options.privileged != "state" or (options.task is None and not options.whole_state)
+    without_state = not (options.privileged in (None, "state") if options.task else options.whole_state)
     own |= {"role_keys": None} if without_state else {}
     noise = float(np.mean(options.noise or 0.0))
     of_preset = preset(options.preset, algorithm=kind, task=options.task, noise=noise)

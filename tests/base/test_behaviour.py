@@ -43,7 +43,7 @@ def test_whoever_has_begun_an_episode_ends_it(per):
 
 @pytest.mark.parametrize(("share", "n_envs", "expected"), [(0.25, 4, 1), (0.5, 4, 2), (0.34, 3, 1), (0.0, 2, 0), (1.0, 2, 2)])
 def test_shares_of_environments_are_the_same_ones_at_each_start(share, n_envs, expected):
-    behaviour = Behaviour(ROLES, {"learner": share}, "environment")
+    behaviour = Behaviour(ROLES, {"learner": share}, "environment", n_envs=n_envs)
     acting = ["guider"] * n_envs
     for _ in range(5):
         acting = behaviour.choose(acting, np.ones(n_envs, dtype=bool), 1.0)
@@ -71,13 +71,34 @@ def test_what_the_collecting_policy_leaves_of_its_share_is_the_deployed_policys(
 @pytest.mark.parametrize("per", ["episode", "environment"])
 def test_shares_of_all_policies_sum_up_to_one(per):
     thirds = {"guider": 1 / 3, "learner": 1 / 3, "other": 1 / 3}
-    chosen = Behaviour(ROLES, thirds, per).choose(["guider"] * 300, np.ones(300, dtype=bool), 1.0)
+    chosen = Behaviour(ROLES, thirds, per, n_envs=300).choose(["guider"] * 300, np.ones(300, dtype=bool), 1.0)
     assert {role: chosen.count(role) for role in thirds} == pytest.approx(dict.fromkeys(thirds, 100), abs=45)
     for shares in ({"guider": 0.5, "learner": 0.25}, {"guider": 0.5, "learner": lambda left: left / 2}):
         with pytest.raises(ValueError, match=r"sum up to 1, as no policy is left for the remainder; got \{'guider': 0.5"):
-            Behaviour(ROLES, shares, per).shares_at(0.5)
+            Behaviour(ROLES, shares, per, n_envs=8).shares_at(0.5)
     with pytest.raises(ValueError, match="no policy is left"):
         small_model(cls=AsymmetricSAC, behaviour={"actor": 0.5})
+
+
+def test_a_share_that_is_no_environment_is_refused():
+    for share, n_envs in ((0.25, 1), (0.25, 2), ("linear 0.1 -> 0.2", 2)):
+        with pytest.raises(ValueError, match=rf"gives learner a share that is less than one of {n_envs} environments"):
+            Behaviour(ROLES, {"learner": share}, "environment", n_envs=n_envs)
+    late = Behaviour(ROLES, {"learner": "linear 0 -> 1"}, "environment", n_envs=1)
+    assert late.acts("learner")
+    assert late.acts("guider")
+    assert not Behaviour(ROLES, {"learner": 1.0}, "environment", n_envs=3).acts("guider")
+    assert not Behaviour(ROLES, {"learner": 0.9}, "environment", n_envs=2).acts("guider"), "its tenth is none of two"
+
+
+def test_other_environments_are_shared_out_anew():
+    """With too few of them the model is as it was."""
+    model = small_model(DummyVecEnv([TwoViewBandit] * 4), behaviour={"learner": 0.25}, behaviour_per="environment")
+    with pytest.raises(ValueError, match="less than one of 1 environments"):
+        model.set_env(DummyVecEnv([TwoViewBandit]))
+    assert model.n_envs == model.chooses_behaviour.n_envs == 4
+    model.set_env(DummyVecEnv([TwoViewBandit] * 8))
+    assert model.learn(30).acting == ["learner"] * 2 + ["guider"] * 6
 
 
 @pytest.mark.parametrize("shares", [{"learner": 1.2}, {"learner": -0.1}, {"learner": 0.6, "other": 0.6}])

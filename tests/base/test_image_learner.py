@@ -126,11 +126,18 @@ def test_a_sequence_is_shifted_as_one():
     assert len(set(shifts[0])) > 2
 
 
+def _channels_last():
+    """Of floating-point numbers, which SB3 leaves in their order."""
+    image, vector = spaces.Box(0, 1, (40, 40, 3), np.float32), spaces.Box(-1, 1, (2,), np.float32)
+    return Sampled(spaces.Dict(partial=image, privileged=vector))
+
+
 @pytest.mark.parametrize(
     ("env", "pixels", "said"),
     [
         (TwoViewBandit, 4, r"random_shift=4 shifts images, but the deployed policy reads \['partial'\], of which none is"),
         (_env, 36, r'random_shift=36 leaves nothing of the entry "partial"'),
+        (_channels_last, 1, r"random_shift=1 needs images with their channels first, and \['partial'\] have them last"),
         (_env, -1, "random_shift must be an integer >= 0"),
         (_env, 0.5, "random_shift must be an integer >= 0"),
     ],

@@ -167,6 +167,17 @@ def test_demonstrations_that_do_not_fit_are_refused(env, observations, actions, 
         clone_behaviour(model, Demonstrations(observations, actions))
 
 
+def test_actions_may_leave_their_range_by_rounding(env):
+    """As SB3's own do where they are saturated, with bounds that are not symmetric."""
+    space = env.action_space
+    outside = np.nextafter(np.full((20, 1), space.high), np.float32(np.inf), dtype=np.float32)
+    shown = Demonstrations({"partial": np.zeros((20, 2), np.float32)}, outside)
+    model = GAC("MultiInputPolicy", env, **SMALL)
+    assert clone_behaviour(model, shown, gradient_steps=2)["after"] < 4
+    with pytest.raises(ValueError, match="which is not in"):
+        clone_behaviour(model, Demonstrations(shown.observations, outside * np.float32(1.0001)))
+
+
 def test_what_can_not_be_cloned_is_refused(env):
     shown = _made_up(env, lambda partial: partial[:, :1])
     recurrent = GAC("MultiInputGruPolicy", env, **SMALL | {"policy_kwargs": {"net_arch": [8], "rnn_hidden_size": 8}})
@@ -204,6 +215,14 @@ def test_networks_that_do_not_fit_are_refused_and_nothing_is_copied(env):
         ValueError, match=r'"actor" of AsymmetricSAC does not fit "learner" of GAC: .* \(8, 2\) there, and \(16, 2\)'
     ):
         copy_networks(model, teacher, {"learner": "actor"})
+    other = GAC("MultiInputPolicy", env, **SMALL | {"policy_kwargs": {"net_arch": [16], "activation_fn": th.nn.ReLU}})
+    with pytest.raises(
+        ValueError, match=r'"learner" of GAC does not fit .* activation_fn is .*ReLU.* there, and .*SiLU.* here'
+    ):
+        copy_networks(model, other, {"learner": "learner"})
+    other = GAC("MultiInputPolicy", env, **SMALL | {"policy_kwargs": {"net_arch": [16], "log_std_bounds": (-20.0, 2.0)}})
+    with pytest.raises(ValueError, match=r"log_std_bounds is \(-20.0, 2.0\) there, and \(-5"):
+        copy_networks(model, other, {"learner": "learner"})
     with pytest.raises(ValueError, match=r"networks: GAC has no network 'actor'; it has \['learner'"):
         copy_networks(model, teacher, {"actor": "actor"})
     assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())

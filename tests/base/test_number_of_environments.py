@@ -120,6 +120,20 @@ def test_noise_made_for_several_environments_is_made_for_as_many_as_there_are():
     assert model.action_noise.n_envs == 2
 
 
+def test_noise_that_is_set_in_the_middle_is_made_for_as_many_as_there_are():
+    model = small_model(_envs(2), learning_starts=0)
+    said = []
+
+    def set_noise(found, _):
+        if found["self"].num_timesteps == 10:
+            model.action_noise = NOISES["normal"]()
+        said.append(getattr(model.action_noise, "n_envs", None))
+        return True
+
+    model.learn(40, callback=set_noise)
+    assert said[-1] == 2, "and an episode has ended since"
+
+
 def test_noise_with_a_memory_begins_anew_with_other_environments():
     model = small_model(_envs(2), action_noise=VectorizedActionNoise(NOISES["with a memory"](), 2))
     model.action_noise.base_noise.noise_prev[:] = 1e6

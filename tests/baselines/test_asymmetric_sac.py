@@ -156,6 +156,12 @@ def test_groups_of_critics_are_of_one_size():
     message = r"critic_groups=2 can't be of the same size with 3 critics: give policy_kwargs"
     with pytest.raises(ValueError, match=message):
         small_model(cls=AsymmetricSAC, critic_groups=2, policy_kwargs={"n_critics": 3})
+    model = small_model(cls=AsymmetricSAC, critic_groups=2, policy_kwargs={"n_critics": 4}).learn(20)
+    for groups in (3, 8):
+        model.critic_groups = groups
+        with pytest.raises(ValueError, match=f"critic_groups={groups} can't be of the same size with 4 critics"):
+            model.learn(20, reset_num_timesteps=False)
+        assert model.critic_groups == 2, "what it was"
 
 
 def test_groups_of_critics_are_compiled():

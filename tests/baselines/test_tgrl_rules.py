@@ -121,6 +121,16 @@ def test_whoever_is_told_to_collect_does():
     assert ended == [["auxiliary"] * 4]
 
 
+def test_actors_take_turns_after_a_teacher_that_collected():
+    model = _model(TwoViewBandit(length=3), learning_starts=0, behaviour={"teacher": 1.0}).learn(4)
+    assert model.acting == ["teacher"]
+    model.behaviour = None
+    ended = []
+    model.on_episode_end = lambda env, episode_return, role: ended.append(role)
+    model.learn(11, reset_num_timesteps=False)
+    assert ended == ["teacher", "actor", "auxiliary", "actor"], "the teacher ends the episode that it has begun"
+
+
 def test_episodes_of_warm_up_are_not_compared():
     model = _model(TwoViewBandit(length=3), learning_starts=10).learn(12)
     assert not any(model.returns.values())
@@ -293,7 +303,8 @@ def test_a_teacher_on_another_scale_is_refused(teacher, env, entry):
 
 
 def test_a_teacher_on_the_same_scale_teaches_and_other_environments_are_looked_at():
-    model = small_model(_normalised(), TGRL, teacher=_sac(_normalised())).learn(20)
+    env = _normalised()
+    model = small_model(env, TGRL, teacher=_sac(env)).learn(20)
     with pytest.raises(ValueError, match='"partial" that was normalised by VecNormalize, but env gives it raw'):
         model.set_env(TwoViewBandit())
     model.learn(20)

@@ -12,8 +12,10 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
-from sb3_gac.envs import SplitDictObservation
+from sb3_gac import GAC
+from sb3_gac.envs import PreviousAction, SplitDictObservation
 from tests.helpers import TwoViewBandit
 from tests.registry import algorithms, deployed_role, load, make
 from tests.sb3_contract.helpers import sample_observations
@@ -213,3 +215,54 @@ def test_an_environment_without_goals_is_named(algorithm):
 def test_goals_of_two_shapes_are_named():
     with pytest.raises(ValueError, match=r'"achieved_goal" in the place of "desired_goal", .* give them one shape'):
         _make("gac", _Goals(_distances, desired=(3,)))
+
+
+def _shown(env, **kwargs):
+    """What is warned of in the first steps."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        _make("gac", env, **kwargs).learn(20)
+    return [str(warning.message) for warning in caught]
+
+
+def test_rewards_that_a_wrapper_changes_are_told_from_those_of_other_goals():
+    """Those of relabelled goals are the inner environment's."""
+    said = "The environment rewarded a step by -10, and compute_reward gives -1 for it. So HerReplayBuffer mixes"
+    ten_times = gym.wrappers.TransformReward(_env(), lambda reward: 10 * reward)
+    assert sum(message.startswith(said) for message in _shown(ten_times)) == 1
+    assert not any("compute_reward" in message for message in _shown(_env()))
+
+
+REACH = {"replay_buffer_class": HerReplayBuffer, "role_keys": {"learner": ["partial", "desired_goal"]}, "buffer_size": 100}
+
+
+def _reach():
+    return gym.make("sb3_gac/FetchReach-v4", goal_entries=True)
+
+
+def test_rewards_are_stored_and_looked_at_as_they_were_before_they_are_normalised():
+    env = VecNormalize(DummyVecEnv([lambda: Monitor(_reach())]), norm_reward=True)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*compute_reward")
+        GAC("MultiInputPolicy", env, **REACH).learn(3)
+
+
+def test_goals_in_another_form_than_the_environments_are_refused():
+    with pytest.raises(ValueError, match=r"compute_reward about goals of the shape \(9,\), but .* shape \(3,\): a wrapper"):
+        GAC("MultiInputPolicy", VecFrameStack(DummyVecEnv([_reach]), 3), **REACH)
+
+
+def test_rewards_for_the_former_goals_are_not_left_in_observations():
+    with pytest.raises(ValueError, match=r"PreviousAction\(reward=True\) keeps rewards for the former goals"):
+        GAC("MultiInputPolicy", PreviousAction(_reach(), reward=True), **REACH)
+    GAC("MultiInputPolicy", PreviousAction(_reach()), **REACH)
+
+
+@with_goals
+def test_networks_that_do_not_know_the_goal_are_refused(algorithm):
+    role, critic = deployed_role(algorithm), next(name for name in make(algorithm, TwoViewBandit()).policy.roles.critics)
+    keys = {role: LEARNER, critic: ["observation"]}
+    said = rf"the {critic}, which reads \['observation'\], would not know .* role_keys={{\"{critic}\": \['observation', 'des"
+    with pytest.raises(ValueError, match=said):
+        make(algorithm, _env(), role_keys=keys, replay_buffer_class=HerReplayBuffer)
+    make(algorithm, _env(), role_keys=keys)  # without hindsight, another entry may hold the goal

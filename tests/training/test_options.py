@@ -16,7 +16,7 @@ from sb3_gac.train import parse_arguments
 from sb3_gac.training.directory import in_words, new_directory
 from sb3_gac.training.environments import find_modules_here
 from sb3_gac.training.job import open_environments, prepare
-from sb3_gac.training.options import DEFAULTS, algorithm_arguments, make_parser
+from sb3_gac.training.options import DEFAULTS, algorithm_arguments, make_parser, resolve
 from tests.helpers import Sampled, TwoViewBandit
 
 OWN = "tests.training.test_options:make_own"
@@ -207,3 +207,32 @@ def test_a_console_script_finds_modules_in_the_working_directory(tmp_path, monke
 
 def test_the_spaces_of_the_bandit_are_what_these_tests_take_them_for():
     assert isinstance(TwoViewBandit().observation_space, spaces.Dict)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "default", "other"),
+    [("Hopper", "state", "velocity"), ("FetchReach", "hidden", "state"), ("h1-walk", "hidden", "state")],
+)
+def test_what_is_privileged_is_said_to_the_environment_as_the_task_has_it(env_id, default, other):
+    """A task's default is never told from a word of one's own by the name that another suite gives its default."""
+    assert parse_arguments(["--task", env_id]).privileged == default
+    for value in (default, other):
+        options = parse_arguments(["--task", env_id, "--privileged", value])
+        assert (options.privileged, options.env_kwargs.get("privileged", default)) == (value, value)
+    sees_all = algorithm_arguments(parse_arguments(["--task", env_id])).get("role_keys") is not None
+    assert sees_all == (default == "state")
+    wrong = next(value for value in ("hidden", "velocity") if value not in (default, other))
+    with pytest.raises(ValueError, match=rf"--privileged: sb3_gac/.* has {default} or {other}, got {wrong}"):
+        resolve({"task": env_id, "privileged": wrong})
+
+
+def test_a_run_that_wrote_down_what_its_task_does_not_have_goes_on_as_it_was(tmp_path):
+    """Of an earlier version, whose default was "state" for all tasks."""
+    job = prepare(parse_arguments(["--task", "FetchReach", "--envs", "1", "--runs", str(tmp_path)]))
+    job.alone.close()
+    path = job.directory / "config.yaml"
+    written = path.read_text()
+    assert "\nprivileged: hidden\n" in written
+    path.write_text(written.replace("\nprivileged: hidden\n", "\nprivileged: state\n"))
+    again = parse_arguments(["--resume", str(job.directory)])
+    assert again.env_kwargs == job.options.env_kwargs

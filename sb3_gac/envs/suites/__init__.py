@@ -39,6 +39,8 @@ class Suite(NamedTuple):
     :param simulator: name of the module that tells whether the simulator is installed, by default the extra's name
     :param preset: name of the preset with which ``python -m sb3_gac.train`` trains on the environments
     :param noise_std: standard deviation of the sensor noise in ``python -m sb3_gac.train`` if none is given
+    :param privileged: values that the environments' argument ``privileged`` may have, the default first; empty if they have
+        no such argument
     """
 
     module: str
@@ -48,6 +50,7 @@ class Suite(NamedTuple):
     simulator: str | None = None
     preset: str = "small"
     noise_std: float = 0.1
+    privileged: tuple[str, ...] = ()
 
     @property
     def environments(self) -> Mapping[str, Mapping[str, Any]]:
@@ -83,22 +86,30 @@ _NAMESPACE = "sb3_gac/"
 _OWN = ("vec_entry_point", "shapes", "whole_state")
 #: Arguments of environments that are stepped one at a time -> value that changes nothing
 _ONE_AT_A_TIME: dict[str, Any] = {"history": 1, "delay": 0, "drop": 0.0}
+_CLEAN, _HIDDEN = ("state", "velocity"), ("hidden", "state")
 _SINGLE = "sb3_gac.envs.vector.single:make_single"
 
 SUITES = {
-    "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True, history=True),
-    "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True, history=True),
-    "pixels": Suite("sb3_gac.envs.suites.pixels", preset="pixels"),
+    "mujoco": Suite("sb3_gac.envs.suites.mujoco", sensor_noise=True, history=True, privileged=_CLEAN),
+    "pendulum": Suite("sb3_gac.envs.suites.pendulum", sensor_noise=True, history=True, privileged=_CLEAN),
+    "pixels": Suite("sb3_gac.envs.suites.pixels", preset="pixels", privileged=_CLEAN),
     "tiger_door": Suite("sb3_gac.envs.suites.tiger_door", noise_std=0.0),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
     "playground": Suite(
         "sb3_gac.envs.suites.playground", sensor_noise=True, extra="envpool", preset="playground", noise_std=0.0
     ),
     "humanoid_bench": Suite(
-        "sb3_gac.envs.suites.humanoid_bench", sensor_noise=True, history=True, simulator="humanoid_bench", noise_std=0.0
+        "sb3_gac.envs.suites.humanoid_bench",
+        sensor_noise=True,
+        history=True,
+        simulator="humanoid_bench",
+        noise_std=0.0,
+        privileged=_HIDDEN,
     ),
-    "brax": Suite("sb3_gac.envs.suites.brax", sensor_noise=True, extra="brax"),
-    "robotics": Suite("sb3_gac.envs.suites.robotics", sensor_noise=True, history=True, preset="robotics", noise_std=0.0),
+    "brax": Suite("sb3_gac.envs.suites.brax", sensor_noise=True, extra="brax", privileged=_CLEAN),
+    "robotics": Suite(
+        "sb3_gac.envs.suites.robotics", sensor_noise=True, history=True, preset="robotics", noise_std=0.0, privileged=_HIDDEN
+    ),
 }
 
 
