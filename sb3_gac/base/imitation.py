@@ -13,8 +13,9 @@ Behaviour cloning (Pomerleau 1991) and DAgger (Ross et al. 2011, arXiv 1011.0686
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -39,7 +40,8 @@ HELD_OUT = 0.1
 _SETTINGS = ("activation_fn", "log_std_bounds", "softplus_min_std", "normalize_images")
 
 
-class Demonstrations(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Demonstrations:
     """
     Observations, and the actions that a policy takes on them. ``+`` joins the demonstrations of two sources; those of a file
     or of another program are made of its arrays.
@@ -51,7 +53,7 @@ class Demonstrations(NamedTuple):
     observations: Mapping[str, np.ndarray]
     actions: np.ndarray
 
-    def __add__(self, other: Any) -> "Demonstrations":
+    def __add__(self, other: "Demonstrations") -> "Demonstrations":
         """
         Join two sets of demonstrations, by the entries that both have.
 
