@@ -4,9 +4,9 @@ Aggregates the finished runs of a suite into a tidy CSV file, and into scores as
     python -m benchmarks.aggregate benchmarks/suites/halfcheetah.yml --out benchmarks/results/halfcheetah
 
 A missing run is an error, since an average over fewer runs would hide it.  ``--complete-cells`` leaves out all runs of the
-suite's cells in which a run is missing, and names the missing runs in the results.  ``--reuse-results`` takes runs whose
-directories are elsewhere, or gone, from the results into which they were aggregated.  Intervals are stratified bootstraps of
-95% (rliable, arXiv 2108.13264).
+suite's cells in which a run is missing.  The results name the missing runs, and keep the finished ones that were left out.
+``--reuse-results`` takes runs whose directories are elsewhere, or gone, from the results into which they were aggregated.
+Intervals are stratified bootstraps of 95% (rliable, arXiv 2108.13264).
 """
 
 import argparse
@@ -14,27 +14,31 @@ import json
 import shlex
 import sys
 from collections.abc import Sequence
+from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from rliable import metrics
 
 from benchmarks.bootstrap import Estimate, estimate, improvements, interval
+from benchmarks.checkpoint import write_together
 from benchmarks.finished import (
     FinishedRun,
     add_reuse_options,
     as_json,
+    is_finished,
     kind_of,
     name_of,
     names_of,
     particulars_of,
     read_directory,
     read_reused,
+    record_of,
     settings_of,
 )
-from benchmarks.run_checks import check_finite, with_equal_returns
+from benchmarks.run_checks import check_finite, check_same_settings, with_equal_returns
 from benchmarks.suite import HERE, RUNS, needed_steps, read_cells
 from benchmarks.tidy import CELL, NAMES, NEEDED, NO_NOISE, file_of, normalised_scores, read_tidy, run_scores, significant
 
@@ -42,9 +46,23 @@ REFERENCE = "sac-asym"
 STEADY_FROM = 5_000
 
 
+class Found(NamedTuple):
+    """
+    The runs of a suite.
+
+    :param counted: records of the finished runs that count
+    :param missing: names of the runs that are not finished
+    :param set_aside: records of the finished runs that do not count, because another run of their cell is missing
+    """
+
+    counted: list[FinishedRun]
+    missing: list[str]
+    set_aside: list[FinishedRun]
+
+
 def finished_runs(
     suite: Path, runs: Path, complete_cells: bool = False, reuse: Sequence[Path] = (), rerun: Sequence[str] = ()
-) -> tuple[list[FinishedRun], list[str]]:
+) -> Found:
     """
     :param suite: YAML file of the suite
     :param runs: directory of all runs
@@ -52,20 +70,26 @@ def finished_runs(
     :param reuse: paths of results, without a suffix, whose runs count where a run has no directory; where two have the same
         run, the later path counts
     :param rerun: names of the algorithms whose runs in ``reuse`` do not count
-    :return: records of the runs to count, and names of the runs that are missing
+    :return: runs that count, those that are missing, and those that are set aside
     :raises FileNotFoundError: naming the runs that are not finished, if they may not be left out or no cell is complete
     :raises ValueError: if a run was made with other settings
     """
     cells = read_cells(suite)
     specs = [spec for cell in cells for spec in cell]
     found = read_reused(reuse, specs, rerun)
-    found |= {name_of(spec): read_directory(spec, runs) for spec in specs if spec.is_finished(runs)}
+    found |= {name_of(spec): read_directory(spec, runs) for spec in specs if is_finished(spec, runs)}
     missing = [name for name in map(name_of, specs) if name not in found]
     names = [[name_of(spec) for spec in cell] for cell in cells]
     complete = [found[name] for cell in names if set(cell) <= set(found) for name in cell]
     if missing and not (complete_cells and complete):
         raise FileNotFoundError(f"{len(missing)} runs are not finished in {runs}: {missing}")
-    return complete, missing
+    counted = {run.name for run in complete}
+    return Found(complete, missing, [run for name, run in found.items() if name not in counted])
+
+
+def _about_set_aside(runs: Sequence[FinishedRun]) -> list[str]:
+    names = [run.name for run in runs]
+    return [f"{len(names)} finished runs are set aside, since other runs of their cells are missing: {names}"] if names else []
 
 
 def collect(runs: list[FinishedRun]) -> pd.DataFrame:
@@ -243,8 +267,10 @@ def _from_checkout(path: Path) -> str:
 def origins(runs: list[FinishedRun]) -> dict[str, Any]:
     """
     :param runs: records of finished runs
-    :return: commits and versions of the runs, their settings and arguments, and the hours that they took
+    :return: commits and versions of the runs, their settings, arguments and normalisation, and the hours that they took
+    :raises ValueError: if seeds of one algorithm in one cell were made with other arguments
     """
+    check_same_settings(runs)
     made_with = _distinct([origin for run in runs for origin in run.origins])
     seconds = [run.seconds for run in runs if run.seconds is not None]
     particulars = {kind_of(run.spec): found for run in runs if (found := particulars_of(run.spec))}
@@ -257,6 +283,7 @@ def origins(runs: list[FinishedRun]) -> dict[str, Any]:
         "seconds_per_run": {"median": round(float(np.median(seconds)), 1), "max": round(max(seconds), 1)} if seconds else {},
         "settings": settings_of(runs[0].spec),
         "arguments": {kind_of(run.spec): run.arguments for run in runs},
+        "normalize": {kind_of(run.spec): run.normalize for run in runs if run.normalize is not None},
         **({"particulars": particulars} if particulars else {}),
         "runs": {
             run.name: {"seconds": run.seconds, "made_with": [made_with.index(origin) for origin in run.origins]}
@@ -286,31 +313,31 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add_reuse_options(parser)
     options = parser.parse_args(arguments)
     try:
-        runs, missing = finished_runs(
-            options.suite, options.runs, options.complete_cells, options.reuse_results, options.rerun
-        )
+        found = finished_runs(options.suite, options.runs, options.complete_cells, options.reuse_results, options.rerun)
+        runs = found.counted
         check_finite(runs)
         reference = choose_reference(list(dict.fromkeys(run.spec.algorithm for run in runs)), options.reference)
+        made = origins(runs)
     except (ValueError, OSError) as error:
         sys.exit(str(error))
-    evaluations = file_of(options.out, "csv")
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    table = collect(runs).replace({"noise": {NO_NOISE: np.nan}})
-    table.to_csv(evaluations, index=False, float_format="%.6g")
-    tidy = read_tidy(evaluations)  # so that the scores can be computed from the file to the last digit
+    text = collect(runs).replace({"noise": {NO_NOISE: np.nan}}).to_csv(index=False, float_format="%.6g")
+    tidy = read_tidy(StringIO(text))  # so that the scores can be computed from the file to the last digit
     equal = with_equal_returns(tidy)
-    if equal:
-        print("\n".join(equal), file=sys.stderr)
+    for sentence in [*equal, *_about_set_aside(found.set_aside)]:
+        print(sentence, file=sys.stderr)
     results = {
         "command": command(options),
-        **origins(runs),
-        "still_to_run": missing,
+        **made,
+        "still_to_run": found.missing,
+        "set_aside": {run.name: record_of(run) for run in found.set_aside},
         "equal_returns": equal,
         "reference": reference,
         "cells": summarise_cells(tidy, reference),
         **compare(tidy),
     }
-    file_of(options.out, "json").write_text(json.dumps(as_json(results), indent=1, allow_nan=False))
+    record = json.dumps(as_json(results), indent=1, allow_nan=False)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    write_together({file_of(options.out, "csv"): text, file_of(options.out, "json"): record})
 
 
 if __name__ == "__main__":

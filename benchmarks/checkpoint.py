@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -26,12 +26,23 @@ def write_atomically(path: Path, text: str) -> None:
     :param path: file to write
     :param text: content of the file
     """
-    temporary = path.with_name(f"{path.name}.tmp")
-    with temporary.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    write_together({path: text})
+
+
+def write_together(texts: Mapping[Path, str]) -> None:
+    """
+    Write files of which none is to be newer than the others: each is written beside its place, then all are moved.
+
+    :param texts: file to write -> content of the file
+    """
+    temporaries = {path: path.with_name(f"{path.name}.tmp") for path in texts}
+    for path, temporary in temporaries.items():
+        with temporary.open("w") as file:
+            file.write(texts[path])
+            file.flush()
+            os.fsync(file.fileno())
+    for path, temporary in temporaries.items():
+        temporary.replace(path)
 
 
 def read_seconds(path: Path) -> float:

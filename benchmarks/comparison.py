@@ -15,11 +15,13 @@ import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from benchmarks import aggregate, launch
+from benchmarks.checkpoint import write_atomically
 from benchmarks.comparison_page import page
-from benchmarks.config import check_programs, check_simulators
+from benchmarks.config import check_programs, check_runs, check_simulators, first_gradient_step, reads_partial_alone
 from benchmarks.environments import EVAL_SEED, environment, make_envs
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, counted, findings, recommendation, worth
-from benchmarks.suite import NAME, RunSpec, default_name, read_definitions, read_suite
+from benchmarks.run import check_unfinished
+from benchmarks.suite import NAME, RunSpec, cells_of, default_name, read_definitions, read_suite
 from benchmarks.tidy import file_of, read_tidy
 from benchmarks.yaml_checks import check_is
 from sb3_gac.envs.goals import DESIRED_GOAL
@@ -31,6 +33,7 @@ from sb3_gac.training.options import from_yaml, mapping, positive
 
 ALGORITHMS = (FULL, ASYMMETRIC, GUIDED, PARTIAL)
 EVALUATIONS, UNTRAINED_EPISODES = 20, 30
+SUITE = "suite.yml"
 _OF_TASKS = {"noise_std", "history"}
 
 
@@ -129,9 +132,13 @@ def write_suite(options: argparse.Namespace) -> Path:
     :return: path of the suite's file
     """
     options.out.mkdir(parents=True, exist_ok=True)
-    path: Path = options.out / "suite.yml"
-    path.write_text(f"# {command(options)}\n" + yaml.safe_dump(suite_of_options(options), sort_keys=False))
+    path: Path = options.out / SUITE
+    write_atomically(path, f"# {command(options)}\n{_as_yaml(options)}")
     return path
+
+
+def _as_yaml(options: argparse.Namespace) -> str:
+    return yaml.safe_dump(suite_of_options(options), sort_keys=False)
 
 
 def command(options: argparse.Namespace) -> str:
@@ -177,13 +184,19 @@ def run(options: argparse.Namespace) -> Path:
     :raises ValueError: before the first run, if the environment, an algorithm or an argument is wrong; after the last one, if
         a run failed
     """
-    suite, runs = write_suite(options), options.out / "runs"
+    runs = options.out / "runs"
     # The processes of runs start in another folder, and must find the modules that this one finds
     os.environ["PYTHONPATH"] = os.pathsep.join([os.getcwd(), *filter(None, [os.environ.get("PYTHONPATH")])])
-    jobs, finished = launch.jobs_left(suite, runs)
+    specs = [spec for cell in cells_of(SUITE, yaml.safe_load(_as_yaml(options))) for spec in cell]
+    check_runs(SUITE, specs)
+    _check_steps(specs)
+    jobs, finished = launch.jobs_of(specs, options.out / SUITE, runs)
+    for job in jobs:
+        check_unfinished(job.spec, runs)
     check_programs(job.spec for job in jobs)
     check_simulators(job.spec for job in jobs)
-    _check_goals(read_suite(suite)[0])
+    _check_goals(specs[0])
+    suite = write_suite(options)  # after all checks: a comparison that is refused leaves an earlier one as it was
     left = f"{counted(len(jobs), 'run')} of {options.steps:,} steps to do"
     print(f"{left}, {finished} done; all is in {options.out}.", flush=True)
     engine = launch.LocalEngine() if options.ray is None else launch.RayEngine(options.ray)
@@ -192,6 +205,16 @@ def run(options: argparse.Namespace) -> Path:
         logs = "\n".join(f"  {job.log}: {job.reason}" for job in failed)
         raise ValueError(f"{counted(len(failed), 'run')} failed. The logs say why; then the same command goes on:\n{logs}")
     return write_results(options, suite, runs)
+
+
+def _check_steps(specs: Sequence[RunSpec]) -> None:
+    """Refuse runs that would end before the first gradient step: their returns are those of policies without training."""
+    for spec in specs:
+        if spec.steps <= (first := first_gradient_step(spec)):
+            raise ValueError(
+                f"--steps: {spec.algorithm} makes its first gradient step after {first:,} steps (learning_starts), so in "
+                f'{spec.steps:,} steps nothing is learned: give more --steps, or --overrides "{{learning_starts: ...}}".'
+            )
 
 
 def _check_goals(spec: RunSpec) -> None:
@@ -219,7 +242,9 @@ def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
     results = options.out / "results"
     aggregate.main([str(suite), "--runs", str(runs), "--out", str(results)])
     tidy = read_tidy(file_of(results, "csv"))
-    found = worth(tidy, untrained_returns(read_suite(suite)[0], options.out / "untrained.json"))
+    specs = read_suite(suite)
+    deployable = {spec.algorithm for spec in specs if reads_partial_alone(spec)}
+    found = worth(tidy, untrained_returns(specs[0], options.out / "untrained.json"), deployable)
     path: Path = options.out / "index.html"
     path.write_text(page(tidy, found, command(options), file_of(results, "json"), options.steps))
     print("\n" + "\n".join([*recommendation(found, options.steps), "", *findings(found)]))

@@ -111,7 +111,7 @@ def _headroom(tidy: pd.DataFrame) -> graph_objects.Figure:
 
 
 def _ends_table(found: Worth) -> str:
-    best = max(found.deployable or found.ends, key=lambda name: float(found.ends[name].mean()))
+    best = max(found.deployable or list(found.ends), key=lambda name: float(found.ends[name].mean()))
     rows = []
     for name, ends in sorted(found.ends.items(), key=lambda item: -float(item[1].mean())):
         mean, low, high = mean_interval(ends)
@@ -147,13 +147,18 @@ def _differences_table(found: Worth) -> str:
 def _how(found: Worth, command: str, results: Path, steps: int) -> str:
     made = json.loads(results.read_text())
     seeds = max(len(end) for end in found.ends.values())
-    origin = {key: made[key] for key in ("made_with", "cpus", "hours", "settings", "arguments") if key in made}
+    origin = {
+        key: made[key]
+        for key in ("made_with", "cpus", "hours", "settings", "arguments", "normalize", "particulars")
+        if key in made
+    }
     return (
         f"<h2>How it was made</h2><p>{counted(seeds, 'seed')} of each algorithm, {steps:,} environment steps "
         "each. A run's end is the mean of the last quarter of its evaluations, on environments that training never sees. "
         "Intervals of differences are Welch's t intervals over seeds. “What was learned” is the distance from the return of "
-        f"the best policy without training, {found.floor}, to the best mean end; less than a twentieth of it counts as no "
-        "difference.</p>"
+        f"the best policy without training, {found.floor}, to the best mean end; for a difference of two algorithms that are "
+        "deployed without privileged entries, to the best mean end of such an algorithm. Less than a twentieth of it counts "
+        "as no difference.</p>"
         f"<pre>{html.escape(command)}</pre>"
         f"<details><summary>Settings and versions</summary><pre>{html.escape(json.dumps(origin, indent=1))}</pre></details>"
     )

@@ -21,8 +21,10 @@ from benchmarks.yaml_checks import check_is, check_keys, check_numbers
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.base.arguments import present_names
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.suites import SUITES, is_batched, suite_of
 from sb3_gac.presets import instantiate, merge, read_preset
+from sb3_gac.presets.noises import defaults_of
 from sb3_gac.training.environments import normalized
 
 POLICY = "MultiInputPolicy"
@@ -143,6 +145,30 @@ def make_small(kind: type, arguments: Mapping[str, Any], env: VecEnv, seed: int)
 
 def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+def reads_partial_alone(spec: RunSpec) -> bool:
+    """
+    :param spec: settings of a run
+    :return: whether the policy that is deployed reads the entry ``partial`` and no other; a program's does, by its contract
+    """
+    kind, arguments = resolve(spec)
+    if issubclass(kind, Program):
+        return True
+    roles = getattr(kind.policy_aliases[arguments.get("policy", POLICY)], "roles", None)  # type: ignore[attr-defined]
+    if roles is None:  # a policy of SB3's, which reads every entry
+        return False
+    role_keys = arguments.get("role_keys") or arguments.get("policy_kwargs", {}).get("role_keys") or {}
+    return set(role_keys.get(roles.deployed, (PARTIAL,))) == {PARTIAL}
+
+
+def first_gradient_step(spec: RunSpec) -> int:
+    """
+    :param spec: settings of a run
+    :return: number of environment steps after which gradient steps begin, 0 if the algorithm has no such argument
+    """
+    kind, arguments = resolve(spec)
+    return int((defaults_of(kind) | arguments).get("learning_starts", 0))
 
 
 def check_programs(specs: Iterable[RunSpec]) -> None:

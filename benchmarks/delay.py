@@ -24,6 +24,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from benchmarks.checkpoint import write_atomically
 from benchmarks.tidy import file_of
 from sb3_gac.networks.recurrent import RecurrentCore
 from sb3_gac.training.provenance import provenance
@@ -186,11 +187,13 @@ def main() -> None:
     known = {Trial(*(row[key] for key in Trial._fields)): row for row in saved}
     wanted = [Trial(*key) for key in itertools.product(CONTENDERS, args.delays, range(args.seeds), [args.steps])]
     rows = [known[trial] for trial in wanted if trial in known]
+    others = [row for trial, row in known.items() if trial not in wanted]
     for row in _run_all([trial for trial in wanted if trial not in known], args.jobs):
         rows.append(row)
         print(row, flush=True)
         command = shlex.join(["python", "-m", "benchmarks.delay", *sys.argv[1:]])
-        path.write_text(json.dumps({"command": command, **provenance(), "trials": rows}, indent=2) + "\n")
+        record = {"command": command, **provenance(), "trials": [*others, *rows]}
+        write_atomically(path, json.dumps(record, indent=2) + "\n")
     print(table(rows))
 
 

@@ -7,12 +7,12 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import pandas as pd
 import yaml
 
-from benchmarks.config import in_present_names, read_algorithm, resolve, settings_in_present_names
+from benchmarks.config import in_present_names, normalization, read_algorithm, resolve, settings_in_present_names
 from benchmarks.suite import UNSAID, RunSpec, made_with
 from benchmarks.tidy import NAMES, NEEDED, NO_NOISE, file_of, read_tidy
 
@@ -20,6 +20,10 @@ _PARTICULARS = ["environment", "definition", "needs", "history"]
 #: Infinite number -> YAML's word for it, in JSON, which has no such numbers; and the reverse
 _WORDS = {math.inf: ".inf", -math.inf: "-.inf"}
 _INFINITE = {word: number for number, word in _WORDS.items()}
+
+
+#: Keyword arguments of ``VecNormalize``, or ``False`` where nothing is normalised
+Normalize: TypeAlias = dict[str, Any] | bool
 
 
 class FinishedRun(NamedTuple):
@@ -32,6 +36,8 @@ class FinishedRun(NamedTuple):
     :param origins: commit and versions of the processes that made the run, one entry for each distinct combination
     :param seconds: seconds that the run took, ``None`` if they were not recorded
     :param cpus: number of CPUs of the machine
+    :param normalize: keyword arguments of the ``VecNormalize`` around the run's environments, ``False`` without one, ``None``
+        if they were not recorded
     """
 
     spec: RunSpec
@@ -40,6 +46,7 @@ class FinishedRun(NamedTuple):
     origins: list[dict[str, Any]]
     seconds: float | None
     cpus: int
+    normalize: Normalize | None = None
 
     @property
     def name(self) -> str:
@@ -89,6 +96,62 @@ def settings_of(spec: RunSpec) -> dict[str, Any]:
     return {name: value for name, value in asdict(spec).items() if name not in [*NAMES, *_PARTICULARS]}
 
 
+def is_finished(spec: RunSpec, runs: Path) -> bool:
+    """
+    :param spec: settings of a run
+    :param runs: directory of all runs
+    :return: whether this run has been finished there
+    :raises ValueError: if its directory holds a finished run with other settings, arguments or normalisation
+    """
+    directory = spec.directory(runs)
+    if not (directory / "evaluations.csv").exists():
+        return False
+    if changed := _changed(spec, yaml.safe_load((directory / "config.yaml").read_text())):
+        hint = "remove it, or use another directory (--runs, or --out of a comparison)"
+        raise ValueError(f"{directory} holds a run with other settings under {changed}: {hint}.")
+    return True
+
+
+def _changed(spec: RunSpec, configuration: Mapping[str, Any]) -> list[str]:
+    """The names of what a run's configuration has with another value than the suite, such as "arguments.tau"."""
+    kind, arguments = resolve(spec)
+    recorded, wanted = (settings_in_present_names(kind, one) for one in (UNSAID | configuration["run"], asdict(spec)))
+    changed = sorted(name for name, value in wanted.items() if recorded.get(name) != value)
+    changed += conflicts("arguments", in_present_names(kind, configuration.get("arguments") or {}), arguments)
+    return changed + ["normalize"] * (_normalize_in(configuration) != normalize_of(spec))
+
+
+def conflicts(name: str, recorded: Any, other: Any) -> list[str]:
+    """
+    Compare recorded arguments with others. One that was not recorded has no other value: earlier versions may have lacked it.
+
+    :param name: name of the arguments, with which the names that are returned begin
+    :param recorded: arguments as they were recorded, or one of them
+    :param other: arguments to compare with, or one of them
+    :return: names of the recorded arguments that the others lack, or have with another value
+    """
+    if not (isinstance(recorded, Mapping) and isinstance(other, Mapping)):
+        return [name] if recorded != other else []
+    lacking = [f"{name}.{key}" for key in recorded if key not in other]
+    return lacking + [
+        found for key in recorded if key in other for found in conflicts(f"{name}.{key}", recorded[key], other[key])
+    ]
+
+
+def normalize_of(spec: RunSpec) -> Normalize:
+    """
+    :param spec: settings of a run
+    :return: keyword arguments of the ``VecNormalize`` around its environments, ``False`` without one
+    """
+    options = normalization(spec)
+    return False if options is None else dict(options)
+
+
+def _normalize_in(configuration: Mapping[str, Any]) -> Normalize:
+    normalize: Normalize = configuration.get("normalize", False)  # a run without normalisation has no such key
+    return normalize
+
+
 def read_directory(spec: RunSpec, runs: Path) -> FinishedRun:
     """
     :param spec: settings of a finished run
@@ -104,6 +167,7 @@ def read_directory(spec: RunSpec, runs: Path) -> FinishedRun:
         made_with(configuration),
         json.loads((directory / "timing.json").read_text())["seconds"],
         configuration["cpus"],
+        _normalize_in(configuration),
     )
 
 
@@ -180,16 +244,54 @@ def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]
             f"{file_of(path, 'json')} does not tell its runs apart: it was aggregated before they could be taken up again."
         )
     evaluations = dict(list(read_tidy(file_of(path, "csv")).drop(columns=NEEDED, errors="ignore").groupby(NAMES)))
-    return {name_of(spec): _recorded(spec, results, evaluations) for spec in specs if _is_among(results, spec)}
+    found = ((spec, _record_of(spec, results)) for spec in specs)
+    return {
+        name_of(spec): _recorded(spec, record, evaluations, results["cpus"])
+        for spec, record in found
+        if record is not None and _is_as_now(spec, results["settings"], record)
+    }
 
 
-def _is_among(results: Mapping[str, Any], spec: RunSpec) -> bool:
-    if name_of(spec) not in results["runs"]:
-        return False
+def record_of(run: FinishedRun) -> dict[str, Any]:
+    """
+    :param run: records of a finished run that does not count in results
+    :return: all that :func:`read_results` needs to count the run another time
+    """
+    rows = run.evaluations.astype(object)
+    return {
+        "seconds": run.seconds,
+        "origins": run.origins,
+        "arguments": run.arguments,
+        "particulars": particulars_of(run.spec),
+        "normalize": run.normalize,
+        "evaluations": rows.where(rows.notna(), None).to_dict(orient="list"),  # JSON has no NaN
+    }
+
+
+def _record_of(spec: RunSpec, results: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The records of a run in results, as :func:`record_of` writes them; a run that counts has its evaluations elsewhere."""
+    name, kind = name_of(spec), kind_of(spec)
+    if name not in results["runs"]:
+        aside: Mapping[str, Any] | None = results.get("set_aside", {}).get(name)
+        return aside
+    of_run = results["runs"][name]
+    return {
+        "seconds": of_run["seconds"],
+        "origins": [results["made_with"][index] for index in of_run["made_with"]],
+        "arguments": results["arguments"][kind],
+        "particulars": results.get("particulars", {}).get(kind, {}),
+        "normalize": results.get("normalize", {}).get(kind),  # earlier results have no record of it
+    }
+
+
+def _is_as_now(spec: RunSpec, settings: dict[str, Any], record: Mapping[str, Any]) -> bool:
+    """Whether a run was made with the settings and arguments of today's suite."""
     kind, arguments = resolve(spec)
-    recorded = UNSAID | results["settings"], results.get("particulars", {}).get(kind_of(spec), {})
+    recorded = UNSAID | settings, record["particulars"]
     now = settings_of(spec), particulars_of(spec)
-    return in_present_names(kind, results["arguments"][kind_of(spec)]) == arguments and all(
+    if record["normalize"] is not None and record["normalize"] != normalize_of(spec):
+        return False
+    return in_present_names(kind, record["arguments"]) == arguments and all(
         settings_in_present_names(kind, before) == settings_in_present_names(kind, after)
         for before, after in zip(recorded, now, strict=True)
     )
@@ -199,9 +301,10 @@ def _recorded_arguments(spec: RunSpec, recorded: Mapping[str, Any]) -> dict[str,
     return in_present_names(read_algorithm(spec.algorithm, spec.definition)[0], recorded)
 
 
-def _recorded(spec: RunSpec, results: Mapping[str, Any], evaluations: Mapping[Any, pd.DataFrame]) -> FinishedRun:
-    of_run = results["runs"][name_of(spec)]
-    rows = evaluations[tuple(names_of(spec).values())].drop(columns=NAMES).dropna(axis=1, how="all")
-    origins = [results["made_with"][index] for index in of_run["made_with"]]
-    arguments = _recorded_arguments(spec, results["arguments"][kind_of(spec)])
-    return FinishedRun(spec, rows, arguments, origins, of_run["seconds"], results["cpus"])
+def _recorded(spec: RunSpec, record: Mapping[str, Any], evaluations: Mapping[Any, pd.DataFrame], cpus: int) -> FinishedRun:
+    if "evaluations" in record:
+        rows = pd.DataFrame(record["evaluations"])
+    else:
+        rows = evaluations[tuple(names_of(spec).values())].drop(columns=NAMES).dropna(axis=1, how="all")
+    arguments = _recorded_arguments(spec, record["arguments"])
+    return FinishedRun(spec, rows, arguments, record["origins"], record["seconds"], cpus, record["normalize"])

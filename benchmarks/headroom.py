@@ -10,7 +10,7 @@ prints the ends of all runs, how much they vary, and each algorithm's difference
 import argparse
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +28,8 @@ FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
 TITLES = {FULL: "SAC on the full state", ASYMMETRIC: "SAC-asym", GUIDED: "GAC", PARTIAL: "SAC on partial alone"}
 #: Algorithms without privileged entries at deployment, the simplest first: of several that come equally far, it is enough
 SIMPLER_FIRST = (PARTIAL, ASYMMETRIC, GUIDED)
+#: What trains nothing, so that nobody need deploy it
+UNTRAINED = "random-actions"
 #: Share of a run's evaluations, the last ones, whose mean is the run's end; one evaluation of a few episodes says little
 END = 0.25
 #: Share of the learned return below which a difference does not matter
@@ -35,7 +37,7 @@ NEGLIGIBLE = 0.05
 #: Number of seeds above which a comparison had better have more steps
 MANY_SEEDS = 20
 #: Share of the learned return that the recommended number of seeds shows in four of five repetitions
-WORTH_SEEING, _POWER_QUANTILES = 0.1, float(stats.norm.ppf(0.975) + stats.norm.ppf(0.8))
+WORTH_SEEING, POWER = 0.1, 0.8
 
 
 class Worth(NamedTuple):
@@ -49,6 +51,7 @@ class Worth(NamedTuple):
     :param headroom: difference of SAC on the full state over SAC-asym, ``None`` if one of the two has no runs
     :param in_training: difference of SAC-asym over SAC on partial alone, ``None`` if one of the two has no runs
     :param guider: difference of GAC over SAC-asym, ``None`` if one of the two has no runs
+    :param deployable: algorithms that need no privileged entry at deployment, the simplest first
     """
 
     ends: dict[str, np.ndarray]
@@ -58,6 +61,7 @@ class Worth(NamedTuple):
     headroom: Difference | None
     in_training: Difference | None
     guider: Difference | None
+    deployable: list[str]
 
     @property
     def floor(self) -> str:
@@ -70,25 +74,42 @@ class Worth(NamedTuple):
         return [name for name, end in self.ends.items() if np.median(end) > self.untrained[self.floor][2]]
 
     @property
-    def deployable(self) -> list[str]:
-        """The algorithms that need no privileged entry at deployment, the simplest first."""
-        others = [name for name in self.ends if name not in (FULL, *SIMPLER_FIRST)]
-        return [name for name in SIMPLER_FIRST if name in self.ends] + others
+    def deployable_span(self) -> float:
+        """The learned return of the best algorithm that can be deployed, so that one that can't be does not make it larger."""
+        best = max((float(self.ends[name].mean()) for name in self.deployable), default=math.nan)
+        return best - self.untrained[self.floor][0]
+
+    def span_of(self, one: Difference) -> float:
+        """
+        :param one: difference of two algorithms
+        :return: learned return that the difference is a share of: that of the deployable ones, if both are
+        """
+        return self.deployable_span if {one.better, one.other} <= set(self.deployable) else self.span
+
+    def verdict(self, one: Difference) -> str:
+        """
+        :param one: difference of two algorithms
+        :return: "same", "more", "less" or "unknown", see :meth:`Difference.verdict`
+        """
+        return one.verdict(NEGLIGIBLE * self.span_of(one))
 
 
-def worth(tidy: pd.DataFrame, untrained: Mapping[str, np.ndarray]) -> Worth:
+def worth(tidy: pd.DataFrame, untrained: Mapping[str, np.ndarray], deployable: Collection[str]) -> Worth:
     """
     :param tidy: evaluations of one task, with the columns algorithm, seed, timesteps and learner
     :param untrained: name of a policy without training, such as "random actions" -> returns of its episodes, shape (N,)
+    :param deployable: names of the algorithms whose deployed policy reads no privileged entry
     :return: worth of privileged information on the task
     """
     ends = by_algorithm(tidy, end_of)
     pairs = ((FULL, ASYMMETRIC), (ASYMMETRIC, PARTIAL), (GUIDED, ASYMMETRIC))
-    differences = [difference(ends, *pair) if set(pair) <= set(ends) else None for pair in pairs]
+    headroom, in_training, guider = (difference(ends, *pair) if set(pair) <= set(ends) else None for pair in pairs)
     best = max(float(end.mean()) for end in ends.values())
     means = {name: mean_interval(returns) for name, returns in untrained.items()}
     span = best - max(mean for mean, _, _ in means.values())
-    return Worth(ends, by_algorithm(tidy, np.mean), means, span, *differences)
+    names = [name for name in ends if name in deployable and name != UNTRAINED]
+    simpler_first = sorted(names, key=lambda name: SIMPLER_FIRST.index(name) if name in SIMPLER_FIRST else len(SIMPLER_FIRST))
+    return Worth(ends, by_algorithm(tidy, np.mean), means, span, headroom, in_training, guider, simpler_first)
 
 
 def end_of(returns: np.ndarray) -> float:
@@ -126,17 +147,37 @@ def headroom_curve(tidy: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["timesteps", "value", "low", "high"])
 
 
-def seeds_to_see(found: Worth, part: float = WORTH_SEEING) -> int:
+def seeds_to_see(found: Worth, part: float = WORTH_SEEING) -> int | None:
     """
     :param found: worth of privileged information on the task
-    :param part: size of a difference, as a share of the span
+    :param part: size of a difference, as a share of the learned return of the best algorithm that can be deployed
     :return: number of seeds of each algorithm that shows such a difference in four of five repetitions, estimated from the
-        variances of the runs
+        variances of the runs; ``None`` with single seeds, which have no variance, or if nothing was learned
     """
     variances = [float(end.var(ddof=1)) for end in found.ends.values() if len(end) > 1]
-    if not variances or found.span <= 0:
-        return 2
-    return max(2, math.ceil(2 * float(np.mean(variances)) * (_POWER_QUANTILES / (part * found.span)) ** 2))
+    size = part * found.deployable_span
+    if not variances or not size > 0:
+        return None
+    deviation = math.sqrt(np.mean(variances))
+    normal = float(stats.norm.ppf((1 + CONFIDENCE) / 2) + stats.norm.ppf(POWER))
+    seeds = max(2, math.floor(2 * (normal * deviation / size) ** 2))  # for known variances, so at most as many as are needed
+    while power(seeds, size, deviation) < POWER:
+        seeds += 1
+    return seeds
+
+
+def power(seeds: int, size: float, deviation: float) -> float:
+    """
+    :param seeds: number of seeds of each of two algorithms
+    :param size: difference of the algorithms' means
+    :param deviation: standard deviation of the runs of each algorithm
+    :return: probability that the interval of the difference, by Student's t, leaves 0 out
+    """
+    if deviation == 0:
+        return 1.0
+    freedom, shift = 2 * seeds - 2, size / (deviation * math.sqrt(2 / seeds))
+    bound = float(stats.t.ppf((1 + CONFIDENCE) / 2, freedom))
+    return float(stats.nct.sf(bound, freedom, shift) + stats.nct.cdf(-bound, freedom, shift))
 
 
 def findings(found: Worth) -> list[str]:
@@ -173,7 +214,7 @@ _GUIDER = {
 
 
 def _sentence(found: Worth, one: Difference, texts: Mapping[str, str]) -> str:
-    return texts[one.verdict(NEGLIGIBLE * found.span)].format(value=in_words(found, one))
+    return texts[found.verdict(one)].format(value=in_words(found, one))
 
 
 def in_words(found: Worth, one: Difference) -> str:
@@ -184,7 +225,8 @@ def in_words(found: Worth, one: Difference) -> str:
     """
     if math.isinf(one.low):
         return f"{number(one.value)} (of one seed each, which can't tell it from chance)"
-    part = f"; {one.value / found.span:.0%} of what was learned" if found.span > 0 else ""
+    span = found.span_of(one)
+    part = f"; {one.value / span:.0%} of what was learned" if span > 0 else ""
     return f"{number(one.value)} ({number(one.low)} to {number(one.high)} with {CONFIDENCE:.0%} confidence{part})"
 
 
@@ -204,61 +246,87 @@ def recommendation(found: Worth, steps: int) -> list[str]:
     :return: sentences that name the algorithm to train with, how sure the choice is, and the next steps
     """
     if not found.learned:
-        floor = number(found.untrained[found.floor][0])
         return [
-            f"No algorithm ends above the return of {found.floor} without training, {floor}: nothing was learned in "
-            f"{steps:,} steps, and these runs say nothing about privileged information.",
+            f"No algorithm ends above {_bar(found)}: nothing was learned in {steps:,} steps, and these runs say nothing about "
+            "privileged information.",
             "Give more --steps, or another --preset.",
+        ]
+    if min(len(end) for end in found.ends.values()) == 1:
+        return [
+            "One seed of each algorithm is no basis for a recommendation: which is ahead may be chance. Give more --seeds."
         ]
     return [*_choice(found), *_next_steps(found)]
 
 
+def _bar(found: Worth) -> str:
+    mean, _, high = found.untrained[found.floor]
+    return (
+        f"the return of {found.floor} without training, {number(mean)}, beyond the spread of its episodes (to {number(high)})"
+    )
+
+
 def _choice(found: Worth) -> Sequence[str]:
     """
-    The simplest algorithm of those that end as far as the best, or that can't be told from it and are behind by less than
-    would be worth seeing. One that is further behind, if only by chance, is no choice for few seeds.
+    The simplest algorithm of those that have learned and end as far as the best, or that can't be told from it and are behind
+    by less than would be worth seeing. One that is further behind, if only by chance, is no choice for few seeds. Nor is one
+    that another of them leaves behind beyond chance, though neither can be told from the best.
     """
-    names = found.deployable
-    if not names:
+    if not found.deployable:
         return ["None of these algorithms can be deployed without the privileged entries."]
+    names = [name for name in found.deployable if name in found.learned]
+    without = [title(name) for name in found.deployable if name not in names]
+    if not names:
+        return [f"None that can be deployed has learned: {_names(without, 'does', 'do')} not end above {_bar(found)}."]
     best = max(names, key=lambda name: float(found.ends[name].mean()))
     behind = {name: difference(found.ends, best, name) for name in names}
-    verdicts = {name: one.verdict(NEGLIGIBLE * found.span) for name, one in behind.items()}
-    unknown = [name for name in names if name != best and verdicts[name] == "unknown"]
-    lower = [name for name in unknown if behind[name].value > WORTH_SEEING * found.span]
-    near = [name for name in names if verdicts[name] in ("same", "unknown") and name not in lower]
+    unknown = [name for name in names if name != best and found.verdict(behind[name]) == "unknown"]
+    lower = [name for name in unknown if behind[name].value > WORTH_SEEING * found.deployable_span]
+    close = [name for name in names if found.verdict(behind[name]) in ("same", "unknown") and name not in lower]
+    near = [name for name in close if not _above(found, close, name)]
     told = [f"Train with {title(near[0])}.", *_why(found, near, lower)]
     if near == [best] and not lower and len(names) > 1:
         told.append(f"It ends above {listed([title(name) for name in names if name != best])}, beyond chance.")
+    told += [
+        f"{title(name)} ends below {listed([title(one) for one in _above(found, close, name)])}, beyond chance."
+        for name in close
+        if name not in near
+    ]
+    if without:
+        told.append(f"{_names(without, 'does', 'do')} not end above {_bar(found)}.")
     return told
+
+
+def _above(found: Worth, names: Sequence[str], name: str) -> list[str]:
+    """Those of the names whose ends are above those of one name, beyond chance."""
+    return [other for other in names if found.verdict(difference(found.ends, other, name)) == "more"]
+
+
+def _names(titles: Sequence[str], one: str, several: str) -> str:
+    """Titles of algorithms, and the form of a verb that goes with their number."""
+    return f"{listed(titles)} {one if len(titles) == 1 else several}"
 
 
 def _why(found: Worth, near: Sequence[str], lower: Sequence[str]) -> list[str]:
     """Sentences on the algorithms that end near the chosen one, the first, and on those that end lower, maybe by chance."""
     chosen, *others = near
-    reasons = []
-    if others:
-        sure = all(difference(found.ends, name, chosen).verdict(NEGLIGIBLE * found.span) == "same" for name in others)
-        comes = "comes" if len(others) == 1 else "come"
-        why = f"{comes} about equally far" if sure else "can't be told from it with these seeds"
-        reasons.append(f"It is the simplest of those that do best: {listed([title(name) for name in others])} {why}.")
+    same = [title(name) for name in others if found.verdict(difference(found.ends, name, chosen)) == "same"]
+    unknown = [title(name) for name in others if title(name) not in same]
+    clauses = [f"{_names(same, 'comes', 'come')} about equally far"] if same else []
+    clauses += [f"{listed(unknown)} can't be told from it with these seeds"] if unknown else []
+    reasons = [f"It is the simplest of those that do best: {'; '.join(clauses)}."] if clauses else []
     if lower:
-        end = "ends" if len(lower) == 1 else "end"
-        reasons.append(
-            f"{listed([title(name) for name in lower])} {end} lower on average, which may be chance with these seeds."
-        )
+        ends = _names([title(name) for name in lower], "ends", "end")
+        reasons.append(f"{ends} lower on average, which may be chance with these seeds.")
     return reasons
 
 
 def _next_steps(found: Worth) -> Sequence[str]:
     least = min(len(end) for end in found.ends.values())
     needed = seeds_to_see(found)
-    unknown = any(
-        one is not None and one.verdict(NEGLIGIBLE * found.span) == "unknown"
-        for one in (found.headroom, found.in_training, found.guider)
-    )
+    differences = (found.headroom, found.in_training, found.guider)
+    unknown = any(one is not None and found.verdict(one) == "unknown" for one in differences)
     hints = []
-    if unknown:
+    if unknown and needed is not None:
         size = f"a difference of {WORTH_SEEING:.0%} of what was learned"
         if needed > least:
             hints.append(f"What can't be told is a matter of seeds: {needed} of each algorithm would most likely show {size}.")
@@ -266,7 +334,7 @@ def _next_steps(found: Worth) -> Sequence[str]:
                 hints.append("These are many. Runs that have learned more often differ less, so try more --steps first.")
         else:
             hints.append(f"What can't be told is small: {least} seeds would most likely have shown {size}.")
-    if found.headroom is not None and found.headroom.verdict(NEGLIGIBLE * found.span) == "more":
+    if found.headroom is not None and found.verdict(found.headroom) == "more":
         hints.append(
             "Since there is headroom, try what shows the policy more: the History wrapper, a recurrent policy, another sensor."
         )

@@ -29,7 +29,7 @@ from rich.text import Text
 
 from benchmarks.config import check_programs, check_runs, check_simulators
 from benchmarks.engines import Engine, LocalEngine, RayEngine
-from benchmarks.finished import add_reuse_options, name_of, read_reused
+from benchmarks.finished import add_reuse_options, is_finished, name_of, read_reused
 from benchmarks.jobs import Clock, Job, reason_in
 from benchmarks.overview import Overview, line, table, why_not_started
 from benchmarks.run import file_for
@@ -50,8 +50,23 @@ def jobs_left(suite: Path, runs: Path, reuse: Sequence[Path] = (), rerun: Sequen
     """
     specs = read_suite(suite)
     check_runs(suite.name, specs)
+    return jobs_of(specs, suite, runs, reuse, rerun)
+
+
+def jobs_of(
+    specs: Sequence[RunSpec], suite: Path, runs: Path, reuse: Sequence[Path] = (), rerun: Sequence[str] = ()
+) -> tuple[list[Job], int]:
+    """
+    :param specs: settings of a suite's runs, which have been checked
+    :param suite: YAML file of the suite, which the jobs' processes read
+    :param runs: directory of all runs
+    :param reuse: paths of results, without a suffix, whose runs count as finished too
+    :param rerun: names of the algorithms whose runs in ``reuse`` do not count
+    :return: jobs and number of finished runs, see :func:`jobs_left`
+    :raises ValueError: if the directory of a run holds a finished run with other settings
+    """
     made = read_reused(reuse, specs, rerun)
-    left = [(index, spec) for index, spec in enumerate(specs) if not spec.is_finished(runs) and name_of(spec) not in made]
+    left = [(index, spec) for index, spec in enumerate(specs) if not is_finished(spec, runs) and name_of(spec) not in made]
     jobs: dict[str, Job] = {}
     for index, spec in left:
         _add_job(jobs, spec, partial(run_command, suite, index, runs), runs)
@@ -84,7 +99,7 @@ def _add_job(
 
 def _has_left(argument: str, spec: RunSpec, runs: Path) -> bool:
     """Whether a run is finished, and the file that another run needs of it is there."""
-    return spec.is_finished(runs) and file_for(argument, spec, runs).exists()
+    return is_finished(spec, runs) and file_for(argument, spec, runs).exists()
 
 
 def run_command(suite: Path, index: int, runs: Path, needed: Sequence[str] = ()) -> list[str]:

@@ -27,6 +27,7 @@ from benchmarks.page.digits import with_all_digits
 from benchmarks.page.document import page
 from benchmarks.page.plots import RETURN, curves, has_guider, steps_label
 from benchmarks.page.plots import interactive as interactive  # the plot of returns on the page, a figure of plotly
+from benchmarks.page.summary import seeds_compared
 from benchmarks.tidy import NEEDED, file_of, number, read_tidy, with_needed_steps
 
 matplotlib.use("Agg")
@@ -111,7 +112,8 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
         noise = "" if cell["noise"] is None else f"{cell['noise']:g}"
         after = f", after {cell[NEEDED]:,} steps of needed runs" if NEEDED in cell else ""
         first = (cell["task"], noise, cell["algorithm"] + after, seeds, plain(cell["final_mean"]))
-        rows.append((*first, f"{plain(iqm)} [{plain(low)}, {plain(high)}]", guider, kl))
+        interval = f" [{plain(low)}, {plain(high)}]" if len(cell["final"]) > 1 else ""
+        rows.append((*first, f"{plain(iqm)}{interval}", guider, kl))
     return markdown(head, rows)
 
 
@@ -121,8 +123,9 @@ def overall_table(results: dict[str, Any]) -> str:
     :return: Markdown table of the comparisons over all cells
     """
     sections = (("normalised_iqm", "normalised IQM"), ("probability_of_improvement", "probability of improvement"))
+    several = seeds_compared(results) > 1
     rows = [
-        (label, name, f"{value:.2f} [{low:.2f}, {high:.2f}]")
+        (label, name, f"{value:.2f}" + (f" [{low:.2f}, {high:.2f}]" if several else ""))
         for key, label in sections
         for name, (value, low, high) in results[key].items()
     ]

@@ -26,6 +26,7 @@ from benchmarks.checkpoint import TIMING, checkpoints_of, read_seconds, write_at
 from benchmarks.config import POLICY, in_present_names, normalization, resolve, settings_in_present_names
 from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.external import Program
+from benchmarks.finished import is_finished
 from benchmarks.program import read_rows, rows_as_text
 from benchmarks.suite import RUNS, UNSAID, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.base.recording import holds_every_step
@@ -51,15 +52,13 @@ def run(spec: RunSpec, root: Path, progress_bar: bool = False) -> Path:
     :raises ValueError: if its directory holds a run with another configuration, or a run that it needs is not finished
     """
     directory = spec.directory(root)
-    if spec.is_finished(root):
+    if is_finished(spec, root):
         return directory
     algorithm_class, arguments = resolve(spec)
     models = {argument: str(file_for(argument, needed, root)) for argument, needed in needed_runs(spec).items()}
     directory.mkdir(parents=True, exist_ok=True)
     with locked(directory):
-        configuration = {"run": dataclasses.asdict(spec), "arguments": arguments}
-        if (options := normalization(spec)) is not None:
-            configuration["normalize"] = options
+        configuration = _configuration(spec, arguments)
         _refuse_other_settings(directory / CONFIGURATION, algorithm_class, configuration)
         if issubclass(algorithm_class, Program):
             history = _run_program(spec, directory, algorithm_class(**arguments), configuration)
@@ -80,11 +79,27 @@ def file_for(argument: str, spec: RunSpec, root: Path) -> Path:
     :raises ValueError: if the other run is not finished, or its file is gone
     """
     path = spec.directory(root) / (RECORDING if argument == "recording" else MODEL)
-    if not spec.is_finished(root):
+    if not is_finished(spec, root):
         raise ValueError(f"{path.parent} is needed, and not finished: run it first, as benchmarks.launch does.")
     if not path.exists():
         raise ValueError(f"{path} is needed, and gone: remove {path.parent}, and run it again.")
     return path
+
+
+def _configuration(spec: RunSpec, arguments: dict[str, Any]) -> dict[str, Any]:
+    """What is recorded of a run's settings, before the commit and the versions."""
+    options = normalization(spec)
+    return {"run": dataclasses.asdict(spec), "arguments": arguments} | ({} if options is None else {"normalize": options})
+
+
+def check_unfinished(spec: RunSpec, root: Path) -> None:
+    """
+    :param spec: settings of a run that is not finished
+    :param root: directory of all runs
+    :raises ValueError: if the run was begun with other settings
+    """
+    algorithm_class, arguments = resolve(spec)
+    _refuse_other_settings(spec.directory(root) / CONFIGURATION, algorithm_class, _configuration(spec, arguments))
 
 
 def _refuse_other_settings(path: Path, algorithm_class: type, configuration: dict[str, Any]) -> None:
@@ -92,7 +107,7 @@ def _refuse_other_settings(path: Path, algorithm_class: type, configuration: dic
     if path.exists():
         before = yaml.safe_load(path.read_text())
         now, then = (_comparable(algorithm_class, one) for one in (configuration, before))
-        changed = [key for key in configuration if then.get(key) != now[key]]
+        changed = [key for key in dict.fromkeys((*configuration, "normalize")) if then.get(key) != now.get(key)]
         if changed:
             raise ValueError(f"{path.parent} holds an unfinished run with other settings under {changed}: remove it first.")
 
@@ -256,7 +271,11 @@ def main() -> None:
         sys.exit(f"--index: {options.suite} has runs from 0 to {len(specs) - 1}, got {options.index}.")
     spec = specs[options.index]
     for argument in options.needed:
-        spec = needed_runs(spec)[argument]
+        needed = needed_runs(spec)
+        if argument not in needed:
+            named = f"it needs runs as {sorted(needed)}" if needed else "it needs no other run"
+            sys.exit(f"--needed: {spec.algorithm} needs no run as {argument!r}; {named}.")
+        spec = needed[argument]
     print(run(spec, options.runs, progress_bar=sys.stderr.isatty()))
 
 

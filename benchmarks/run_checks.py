@@ -1,4 +1,7 @@
-"""Checks of finished runs before they are compared: returns that are no numbers, and algorithms that are one and the same."""
+"""
+Checks of finished runs before they are compared: returns that are no numbers, seeds with other arguments, and algorithms that
+are one and the same.
+"""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -6,7 +9,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
-from benchmarks.finished import FinishedRun
+from benchmarks.finished import FinishedRun, conflicts, kind_of
 from benchmarks.tidy import CELL, NO_NOISE
 
 
@@ -26,6 +29,29 @@ def check_finite(runs: Sequence[FinishedRun]) -> None:
                 where = f"{run.name}, after {rows.timesteps[wrong].iloc[0]:,} steps"
                 raise ValueError(
                     f"{where}: {name} is {values[wrong].iloc[0]}: make the run again, or leave it out of the suite."
+                )
+
+
+def check_same_settings(runs: Sequence[FinishedRun]) -> None:
+    """
+    :param runs: records of finished runs
+    :raises ValueError: naming two seeds of one algorithm in one cell that were made with other arguments or another
+        normalisation, of which no average would mean anything
+    """
+    by_kind: dict[str, list[FinishedRun]] = {}
+    for run in runs:
+        by_kind.setdefault(kind_of(run.spec), []).append(run)
+    for of_kind in by_kind.values():
+        for one, other in combinations(of_kind, 2):
+            back = conflicts("arguments", other.arguments, one.arguments)
+            there = conflicts("arguments", one.arguments, other.arguments)
+            differing = [name for name in there if name in back]  # what one of the two did not record is in one list alone
+            if None not in (one.normalize, other.normalize) and one.normalize != other.normalize:
+                differing.append("normalize")
+            if differing:
+                raise ValueError(
+                    f"{one.name} and {other.name} were made with different values of {differing}: make one of them again, "
+                    "with the suite's settings, or leave it out of the suite."
                 )
 
 

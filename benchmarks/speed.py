@@ -6,13 +6,14 @@ Measures gradient steps, replay buffers and other costs, beside those of SB3's S
 The contenders alternate in blocks, each in a process of its own; a ratio is the median of the blocks' ratios.  The limit of a
 gradient step is the rate of its matrix products alone, each as fast as a plain product that is timed in the same run.
 Gradient steps and buffers have the sizes of the tasks' spaces and random data; the rollout is one of HalfCheetah itself.
+Tables that the file of results has already stay, unless they are measured again.
 """
 
 import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
 
 import sb3_gac
+from benchmarks.checkpoint import write_atomically
 from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.models import (
     BASELINES,
@@ -362,6 +364,22 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join([*lines, *("| " + " | ".join(str(value) for value in row.values()) + " |" for row in rows)])
 
 
+def with_table(
+    record: Mapping[str, Any], name: str, rows: list[dict[str, Any]], made_with: Mapping[str, Any]
+) -> dict[str, Any]:
+    """
+    :param record: content of the file of results, empty if there is none
+    :param name: name of a table
+    :param rows: rows of the table
+    :param made_with: command, commit, versions and machine with which the table was made
+    :return: content of the file with this table; all other tables stay, and "made_with" has the origin of each
+    """
+    tables = {key: value for key, value in record.items() if key not in (*made_with, "made_with")}
+    of_all = {key: record[key] for key in made_with if key in record}  # files of earlier versions have one origin
+    origins = {**{table: of_all for table in tables if of_all}, **record.get("made_with", {}), name: dict(made_with)}
+    return {"made_with": origins, **tables, name: rows}
+
+
 def main() -> None:
     """Entry point of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -371,12 +389,14 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one size and few rounds")
     options = parser.parse_args()
     flags = f"--threads {' '.join(map(str, options.threads))} --tables {' '.join(options.tables)}"
-    record = {"command": f"python -m benchmarks.speed {flags}{' --quick' if options.quick else ''}", **provenance()}
+    made_with = {"command": f"python -m benchmarks.speed {flags}{' --quick' if options.quick else ''}", **provenance()}
     options.out.parent.mkdir(parents=True, exist_ok=True)
+    path = file_of(options.out, "json")
     for name in options.tables:
-        record[name] = TABLES[name](options.threads, options.quick)
-        file_of(options.out, "json").write_text(json.dumps(record, indent=1))
-        print(f"\n{name}\n\n{markdown(record[name])}", flush=True)
+        rows = TABLES[name](options.threads, options.quick)
+        before = json.loads(path.read_text()) if path.exists() else {}
+        write_atomically(path, json.dumps(with_table(before, name, rows, made_with), indent=1))
+        print(f"\n{name}\n\n{markdown(rows)}", flush=True)
 
 
 if __name__ == "__main__":

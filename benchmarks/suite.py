@@ -4,11 +4,9 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from benchmarks.yaml_checks import check_is, check_keys, check_list, check_numbers, read_yaml
 from sb3_gac.presets import read_preset
@@ -84,22 +82,6 @@ class RunSpec:
         """
         return root / f"{self.preset}-{self.steps}" / self.cell / self.algorithm / f"seed{self.seed}"
 
-    def is_finished(self, root: Path) -> bool:
-        """
-        :param root: directory of all runs
-        :return: whether this run has been finished there
-        :raises ValueError: if the directory holds a finished run with other settings
-        """
-        directory = self.directory(root)
-        if not (directory / "evaluations.csv").exists():
-            return False
-        there = UNSAID | yaml.safe_load((directory / "config.yaml").read_text())["run"]
-        changed = sorted(key for key, value in asdict(self).items() if there.get(key) != value)
-        if changed:
-            hint = "remove it, or use another directory (--runs, or --out of a comparison)"
-            raise ValueError(f"{directory} holds a run with other settings under {changed}: {hint}.")
-        return True
-
 
 def needed_runs(spec: RunSpec) -> dict[str, RunSpec]:
     """
@@ -155,24 +137,34 @@ def read_cells(path: Path) -> list[list[RunSpec]]:
     :return: settings of its runs: one list for each noise of each entry of ``cells``
     :raises ValueError: if a key is unknown or missing, or a run is listed twice
     """
-    suite = read_yaml(path)
-    check_is(path.name, suite, "a mapping", Mapping)
-    if "preset" in suite:
-        suite = {**read_preset(suite["preset"]).run, **suite}
-    check_keys(path.name, suite, _SUITE_KEYS, {*_COMMON, "cells"})
-    for key in ("steps", "envs", "eval_every", "eval_episodes"):
-        check_is(f"{path.name}, {key}", suite[key], "a whole number above 0", int, lambda number: number > 0)
-    if not suite["envs"] <= suite["eval_every"] <= suite["steps"]:
-        numbers = ", ".join(f"{key} {suite[key]}" for key in ("envs", "eval_every", "steps"))
-        raise ValueError(f"{path.name}: eval_every must be from envs to steps, or no evaluation is made; there are {numbers}.")
-    if not isinstance(deterministic := suite.get("eval_deterministic", True), bool):
-        raise ValueError(f"{path.name}, eval_deterministic: must be true or false, got {deterministic!r}.")
-    check_is(f"{path.name}, overrides", suite.get("overrides", {}), "a mapping", Mapping)
-    check_is(f"{path.name}, cells", suite["cells"], "a list of at least one cell", list, len)
-    cells = _Reader(path.name, suite).cells()
-    _check_distinct(path.name, [spec for cell in cells for spec in cell])
+    cells = cells_of(path.name, read_yaml(path))
     if str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))
+    return cells
+
+
+def cells_of(name: str, suite: Any) -> list[list[RunSpec]]:
+    """
+    :param name: name of the suite's file, with which an error message begins
+    :param suite: content of the file
+    :return: settings of its runs: one list for each noise of each entry of ``cells``
+    :raises ValueError: if a key is unknown or missing, or a run is listed twice
+    """
+    check_is(name, suite, "a mapping", Mapping)
+    if "preset" in suite:
+        suite = {**read_preset(suite["preset"]).run, **suite}
+    check_keys(name, suite, _SUITE_KEYS, {*_COMMON, "cells"})
+    for key in ("steps", "envs", "eval_every", "eval_episodes"):
+        check_is(f"{name}, {key}", suite[key], "a whole number above 0", int, lambda number: number > 0)
+    if not suite["envs"] <= suite["eval_every"] <= suite["steps"]:
+        numbers = ", ".join(f"{key} {suite[key]}" for key in ("envs", "eval_every", "steps"))
+        raise ValueError(f"{name}: eval_every must be from envs to steps, or no evaluation is made; there are {numbers}.")
+    if not isinstance(deterministic := suite.get("eval_deterministic", True), bool):
+        raise ValueError(f"{name}, eval_deterministic: must be true or false, got {deterministic!r}.")
+    check_is(f"{name}, overrides", suite.get("overrides", {}), "a mapping", Mapping)
+    check_is(f"{name}, cells", suite["cells"], "a list of at least one cell", list, len)
+    cells = _Reader(name, suite).cells()
+    _check_distinct(name, [spec for cell in cells for spec in cell])
     return cells
 
 

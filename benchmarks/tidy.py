@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import TextIO
 
 import pandas as pd
 
@@ -23,9 +24,9 @@ def file_of(results: Path, suffix: str) -> Path:
     return results.with_name(f"{results.name}.{suffix}")
 
 
-def read_tidy(path: Path) -> pd.DataFrame:
+def read_tidy(path: Path | TextIO) -> pd.DataFrame:
     """
-    :param path: CSV file of aggregated evaluations
+    :param path: CSV file of aggregated evaluations, or its text in an open file
     :return: table of evaluations, with ``NO_NOISE`` where the noise is empty
     """
     return pd.read_csv(path, dtype={"noise": float}).fillna({"noise": NO_NOISE})

@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from sb3_gac.training.provenance import provenance
+from sb3_gac.training.provenance import commit, provenance
 
 HERE = Path(__file__).resolve().parent.parent
+PACKAGE = "sb3_gac"
 SIZES = {"128 units, batch 128": (128, 128), "256 units, batch 256": (256, 256), "512 units, batch 256": (512, 256)}
 #: Program of each process: it reads lines with a number of gradient steps, and answers with the mean seconds of a step
 PROGRAM = """
@@ -108,14 +109,14 @@ def compare(other: Path, arguments: Sequence[Any], steps: int, pairs: int) -> di
     return {name: round(float(value), 3) for name, value in numbers.items()}
 
 
-def commit(checkout: Path) -> str:
+def command(words: Sequence[str], checkout: Path) -> str:
     """
-    :param checkout: directory of a checkout
-    :return: abbreviated hash of the checkout's commit
+    :param words: command-line arguments of this program
+    :param checkout: directory of the other checkout, one of the arguments
+    :return: shell command of the same measurement, with the checkout's name in place of its path
     """
-    return subprocess.run(
-        ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
-    ).stdout.strip()
+    given = [checkout.resolve().name if Path(word) == checkout else word for word in words]
+    return shlex.join(["python", "-m", "benchmarks.versus", *given])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -135,6 +136,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--clock", choices=["perf_counter", "process_time"], default="perf_counter")
     parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args(arguments)
+    package = options.checkout.resolve() / PACKAGE
+    if not (package / "__init__.py").exists():
+        sys.exit(
+            f"{options.checkout} is no checkout of this repository, since it has no {PACKAGE}: git worktree add makes one."
+        )
     rows = []
     for algorithm in options.algorithms:
         for size in options.sizes:
@@ -150,8 +156,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     print(json.dumps(rows[-1]), flush=True)
     if options.out is not None:
         record = {
-            "command": shlex.join(["python", "-m", "benchmarks.versus", options.checkout.name, *sys.argv[2:]]),
-            "there": commit(options.checkout),
+            "command": command(sys.argv[1:] if arguments is None else arguments, options.checkout),
+            "there": commit(package),
             **provenance(),
             "rows": rows,
         }

@@ -11,8 +11,8 @@ import yaml
 from plotly.offline import get_plotlyjs
 
 from benchmarks.page.plots import Plot, plots
-from benchmarks.page.summary import in_short, what_was_compared
-from benchmarks.page.tables import differences_table, overall_table, returns_table
+from benchmarks.page.summary import ENOUGH, in_short, seeds_compared, what_was_compared
+from benchmarks.page.tables import differences_table, overall_table, returns_table, with_surroundings
 
 HERE = Path(__file__).parent
 
@@ -32,7 +32,7 @@ def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> 
         f"<h1>{html.escape(title)}</h1><p>{html.escape(what_was_compared(results))}</p>"
         f"<ul class=short>{short}</ul>{tabs(drawn)}"
         f"<h2>Returns</h2>{returns_table(results['cells'])}{_notes(results.get('equal_returns', []))}"
-        f"<h2>Over all cells</h2>{overall_table(results)}"
+        f"<h2>Over all cells</h2>{overall_table(results)}{_about_intervals(results)}"
         f"<h2>How it was made</h2>{_origin(results)}{_logs(results['runs'], runs)}"
     )
     return document(title, body)
@@ -104,12 +104,20 @@ def _notes(equal_returns: Sequence[str]) -> str:
     )
 
 
+def _about_intervals(results: dict[str, Any]) -> str:
+    seeds = seeds_compared(results)
+    if not 1 < seeds < ENOUGH:
+        return ""
+    return f"<p class=note>These are bootstrap intervals. Those of {seeds} seeds are too narrow for a verdict.</p>"
+
+
 def _origin(results: dict[str, Any]) -> str:
     """The HTML with the command, the arguments in which algorithms differ, the settings that they share, and the versions."""
-    differing, shared = differences_table(results["arguments"]) if "arguments" in results else ("", {})
+    differing, shared = differences_table(with_surroundings(results)) if "arguments" in results else ("", {})
     settings = yaml.safe_dump({**results.get("settings", {}), "arguments of all": shared}, sort_keys=False)
     known = ("made_with", "mixed_runs", "cpus", "hours", "timed_runs", "seconds_per_run", "particulars", "still_to_run")
-    origin = yaml.safe_dump({key: results[key] for key in known if key in results}, sort_keys=False)
+    made = {key: results[key] for key in known if key in results} | {"set_aside": list(results.get("set_aside", {}))}
+    origin = yaml.safe_dump(made, sort_keys=False)
     return (
         f"<p>Runs, or those that are missing, and these results again:</p><pre>{html.escape(results['command'])}</pre>"
         f"<details><summary>In what the algorithms differ</summary>{differing}</details>"

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.intervals import mean_interval
+from benchmarks.page.summary import seeds_compared
 from benchmarks.tidy import number
 
 #: Largest number of seeds whose interquartile mean is their mean
@@ -117,19 +118,39 @@ def overall_table(results: Mapping[str, Any]) -> str:
     """
     names = sorted(results["normalised_iqm"], key=lambda name: -results["normalised_iqm"][name][0])
     head = ["algorithm", "normalised IQM", "95% interval", *(f"above {name}" for name in names)]
+    one_seed = seeds_compared(results) == 1
     rows = []
     for name in names:
         value, low, high = results["normalised_iqm"][name]
-        others = [_improvement(results["probability_of_improvement"].get(f"{name} over {other}")) for other in names]
-        rows.append(([Field(name), field(value, ",.2f"), Field(f"{low:.2f} to {high:.2f}"), *others], name == names[0]))
+        interval = Field("one seed" if one_seed else f"{low:.2f} to {high:.2f}")
+        chances = [results["probability_of_improvement"].get(f"{name} over {other}") for other in names]
+        others = [_improvement(chance, one_seed) for chance in chances]
+        rows.append(([Field(name), field(value, ",.2f"), interval, *others], name == names[0]))
     return table(head, rows)
 
 
-def _improvement(estimate: Sequence[float] | None) -> Field:
+def _improvement(estimate: Sequence[float] | None, one_seed: bool) -> Field:
     if estimate is None:
         return Field("", -math.inf)
     value, low, high = estimate
-    return Field(f"{value:.2f} [{low:.2f}, {high:.2f}]", value)
+    return Field(f"{value:.2f}" if one_seed else f"{value:.2f} [{low:.2f}, {high:.2f}]", value)
+
+
+def with_surroundings(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """
+    :param results: aggregated results
+    :return: algorithm in a cell, such as "gac, Hopper, noise 0.1" -> its arguments there; ``normalize``, the arguments of the
+        ``VecNormalize`` around its environments, where they were recorded; and ``needs``, the runs that it needs
+    """
+    particulars, normalize = results.get("particulars", {}), results.get("normalize", {})
+    return {
+        kind: {
+            **arguments,
+            **({"normalize": normalize[kind] or "nothing"} if kind in normalize else {}),
+            **{name: value for name, value in particulars.get(kind, {}).items() if name == "needs"},
+        }
+        for kind, arguments in results.get("arguments", {}).items()
+    }
 
 
 def differences_table(arguments: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict[str, Any]]:

@@ -13,8 +13,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.paper.figures import RESULTS, SCALES, SUITES, Figure, draw, needs, read_figures
+from benchmarks.paper.figures import RESULTS, SCALES, SUITES, Figure, cells_drawn, draw, needs, read_figures
 from benchmarks.paper.tables import TABLES
+from benchmarks.tidy import file_of
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -54,16 +55,18 @@ def suffix(scale: str) -> str:
 
 def make(suites: Sequence[str], jobs: int | None) -> None:
     """
-    Make the missing runs of suites, and aggregate the suites.
+    Make the missing runs of suites, and aggregate the suites. Runs that a suite's results hold are not made again.
 
     :param suites: names of the suites
     :param jobs: number of runs side by side, ``None`` for one on each CPU
     """
     for name in suites:
-        suite = str(SUITES / f"{name}.yml")
+        suite, results = str(SUITES / f"{name}.yml"), RESULTS / name
         at_once = [] if jobs is None else ["--jobs", str(jobs)]
-        for program, own in (("launch", at_once), ("aggregate", ["--out", str(RESULTS / name), "--complete-cells"])):
-            status = subprocess.run([sys.executable, "-m", f"benchmarks.{program}", suite, *own], check=False).returncode
+        reuse = ["--reuse-results", str(results)] if file_of(results, "json").exists() else []
+        for program, own in (("launch", at_once), ("aggregate", ["--out", str(results), "--complete-cells"])):
+            words = [sys.executable, "-m", f"benchmarks.{program}", suite, *own, *reuse]
+            status = subprocess.run(words, check=False).returncode
             if status:
                 sys.exit(f"{name}: {program} ended with status {status}. The same command goes on.")
 
@@ -79,6 +82,8 @@ def show(figure: Figure, scale: str, out: Path) -> None:
     print(f"Figure {figure.number}: {figure.title}.")
     if scale == SCALES[0]:
         print("Other than in the paper:", *(f"  - {text}" for text in figure.differs), sep="\n")
+    if cells := cells_drawn(figure, scale):
+        print("Drawn so far:", *(f"  - {text}" for text in cells), sep="\n")
     print("Runs:", *(f"  - benchmarks/suites/{name}.yml: {needs(name)}" for name in figure.suites(scale)), sep="\n")
     command = f"python -m benchmarks.paper figure {figure.number}" + ("" if scale == SCALES[0] else f" --scale {scale}")
     print(f"To make those that are missing: {command} --run")

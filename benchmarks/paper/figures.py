@@ -10,6 +10,7 @@ import matplotlib
 import pandas as pd
 import yaml
 
+from benchmarks.finished import name_of
 from benchmarks.page.cells import palette, title_of
 from benchmarks.suite import HERE, read_suite
 from benchmarks.tidy import NEEDED, read_tidy, with_needed_steps
@@ -102,7 +103,8 @@ def results_of(suites: Sequence[str]) -> pd.DataFrame:
 def needs(name: str) -> str:
     """
     :param name: name of a suite
-    :return: text with the number of the suite's runs, their steps, how many have been made, and the minutes that a run took
+    :return: text with the number of the suite's runs, their steps, how many of them its results hold and how many they set
+        aside, and the minutes that a run took
     """
     specs = read_suite(SUITES / f"{name}.yml")
     steps = f"{len(specs)} runs of {specs[0].steps:,} steps"
@@ -110,10 +112,28 @@ def needs(name: str) -> str:
     if not path.exists():
         return f"{steps}, none of them made yet"
     results = json.loads(path.read_text())
-    missing = len(results.get("still_to_run", []))
-    made = f"{len(specs) - missing} of them made" if missing else "all made"
+    made, aside = (sum(name_of(spec) in results.get(key, {}) for spec in specs) for key in ("runs", "set_aside"))
+    said = "all made" if made == len(specs) else f"{made} of them made"
     median = results["seconds_per_run"].get("median")
-    return f"{steps}, {made}" + (f" in {median / 60:.0f} minutes of a core each (median)" if median else "")
+    said += f" in {median / 60:.0f} minutes of a core each (median)" if median else ""
+    return f"{steps}, {said}" + (f", {aside} set aside, since other runs of their cells are missing" if aside else "")
+
+
+def cells_drawn(figure: Figure, scale: str) -> list[str]:
+    """
+    :param figure: figure of the paper
+    :param scale: one of ``SCALES``
+    :return: for each group that has results, its cells, and the number of seeds of each algorithm there
+    """
+    told = []
+    for group in figure.groups[scale]:
+        drawn = _Drawn(group, group.wanted(results_of(group.suites)), group.wanted(results_of(group.ends)))
+        if drawn.cells:
+            seeds = drawn.tidy.groupby(["task", "noise", "algorithm"]).seed.nunique()
+            count = str(seeds.min()) if seeds.min() == seeds.max() else f"{seeds.min()} to {seeds.max()}"
+            cells = "; ".join(title_of(*cell) for cell in drawn.cells)
+            told.append(f"{cells}: {count} seed{'' if count == '1' else 's'} of each algorithm")
+    return told
 
 
 def draw(figure: Figure, scale: str, path: Path) -> bool:

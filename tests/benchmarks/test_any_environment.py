@@ -14,7 +14,7 @@ import benchmarks.report
 from benchmarks.aggregate import finished_runs
 from benchmarks.engines import LocalEngine
 from benchmarks.environments import environment, make_envs
-from benchmarks.finished import kind_of, name_of
+from benchmarks.finished import is_finished, kind_of, name_of
 from benchmarks.launch import jobs_left
 from benchmarks.run import run
 from benchmarks.suite import read_suite
@@ -140,7 +140,7 @@ def test_from_suite_to_report_beside_a_task_with_noise(suite, tmp_path, monkeypa
     assert "gac, Pendulum, noise 0.1" not in results["particulars"]
     assert [(cell["task"], cell["noise"]) for cell in results["compared"]["cells"]] == [("Pendulum", 0.1), ("my-line", None)]
 
-    counted, missing = finished_runs(path, tmp_path / "elsewhere", reuse=[out])
+    counted, missing, _ = finished_runs(path, tmp_path / "elsewhere", reuse=[out])
     assert [name_of(run.spec) for run in counted] == [name_of(job.spec) for job in jobs]
     assert not missing
     changed = suite(OWN | {"env_kwargs": {"difficulty": 4}, "algorithms": ["gac", "sac-asym"]}, pendulum)
@@ -227,7 +227,7 @@ def test_a_suite_may_have_algorithms_of_its_own(suite, tmp_path):
     configuration = run(job.spec, tmp_path / "runs") / "config.yaml"
     assert yaml.safe_load(configuration.read_text())["arguments"]["tau"] == 0.25
     own["mine"]["tau"] = 0.5
-    with pytest.raises(ValueError, match=r"other settings under \['definition'\]"):
+    with pytest.raises(ValueError, match=r"other settings under \['definition', 'arguments.tau'\]"):
         jobs_left(suite(OWN | {"algorithms": ["mine"]}, algorithms=own), tmp_path / "runs")
 
 
@@ -267,4 +267,4 @@ def test_runs_from_before_there_were_other_environments_are_finished(tmp_path):
     directory.mkdir(parents=True)
     (directory / "config.yaml").write_text(yaml.safe_dump({"run": run_of}))
     (directory / "evaluations.csv").touch()
-    assert spec.is_finished(tmp_path)
+    assert is_finished(spec, tmp_path)

@@ -15,8 +15,9 @@ from gymnasium import spaces
 
 from benchmarks import comparison, comparison_page, launch
 from benchmarks.comparison import command, main, parse_arguments, suite_of_options
+from benchmarks.config import first_gradient_step, reads_partial_alone
 from benchmarks.run import run
-from benchmarks.suite import RunSpec, read_suite
+from benchmarks.suite import RunSpec, cells_of, read_suite
 
 SPLIT = "sb3_gac.envs:SplitObservation: {partial: [0, 1], privileged: [2]}"
 SMALL = "{learning_starts: 20, batch_size: 4, gradient_steps: 1, policy_kwargs: {net_arch: [4]}}"
@@ -102,6 +103,11 @@ def engine(monkeypatch, tmp_path):
 def _compare(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["compare", *map(str, arguments)])
     main("What it is for")
+
+
+def _specs(*arguments):
+    suite = yaml.safe_load(yaml.safe_dump(_suite(*arguments)))
+    return [spec for cell in cells_of("suite.yml", suite) for spec in cell]
 
 
 def _suite(*arguments):
@@ -220,6 +226,57 @@ def test_what_is_wrong_is_said_before_the_first_run(engine, monkeypatch, argumen
         _compare(monkeypatch, *arguments)
     assert message in str(stop.value)
     assert engine.made == 0
+    assert not Path("comparisons").exists(), "nothing is left of what was refused"
+
+
+def test_a_comparison_that_is_refused_leaves_an_earlier_one_as_it_was(engine, monkeypatch, tmp_path):
+    _compare(monkeypatch, *SHORT, "--seeds", 1, "--algorithms", "sac")
+    there = tmp_path / "comparisons/Pendulum-v1"
+    before = {path: path.read_bytes() for path in there.iterdir() if path.is_file()}
+    assert there / "suite.yml" in before
+    for more, message in (
+        (["--eval-episodes", 2], "other settings under ['eval_episodes', 'overrides', 'arguments.learning_starts']"),
+        (["--overrides", "{nosuch: 1}"], "nosuch"),
+    ):
+        again = [*SHORT, "--seeds", 1, "--algorithms", "sac", "--overrides", SMALL.replace("20", "30"), *more]
+        with pytest.raises(SystemExit) as stop:
+            _compare(monkeypatch, *again)
+        assert message in str(stop.value)
+        assert {path: path.read_bytes() for path in there.iterdir() if path.is_file()} == before
+    assert engine.made == 1
+    (evaluations,) = there.glob("runs/**/evaluations.csv")
+    evaluations.unlink()  # so that the run was begun and is not finished
+    with pytest.raises(SystemExit, match=r"unfinished run with other settings under \['run', 'arguments'\]"):
+        _compare(monkeypatch, *SHORT, "--seeds", 1, "--algorithms", "sac", "--overrides", SMALL.replace("20", "30"))
+    assert {path: path.read_bytes() for path in there.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize(("steps", "overrides"), [(80, "{}"), (2_000, "{}"), (60, "{learning_starts: 60}")])
+def test_runs_without_a_gradient_step_are_refused(steps, overrides, engine, monkeypatch):
+    """The preset small makes none before 2,000 steps."""
+    given = ["--env", "Pendulum-v1", "--wrappers", SPLIT, "--steps", steps, "--overrides", overrides]
+    with pytest.raises(
+        SystemExit, match=r"--steps: sac-full makes its first gradient step after .* nothing is learned"
+    ) as stop:
+        _compare(monkeypatch, *given)
+    assert f"in {steps:,} steps" in str(stop.value)
+    assert engine.made == 0
+    specs = _specs("--env", "m:make", "--steps", 2_001)
+    assert [first_gradient_step(spec) for spec in specs] == [2_000] * 20
+    comparison._check_steps(specs)
+    assert first_gradient_step(_specs("--env", "m:make", "--algorithms", "gpo-clip")[0]) == 0, "rollouts come at once"
+    assert first_gradient_step(replace(specs[0], algorithm="sb3-sac", preset="sb3", overrides={})) == 2_000
+
+
+def test_what_can_be_deployed_is_decided_by_what_the_deployed_policy_reads():
+    names = ("sac-full", "sac-asym", "gac", "sac", "sb3-sac", "gpo-clip", "rma", "tgrl", "dreamer-v3")
+    spec = replace(_specs("--env", "m:make")[0], overrides={"role_keys": None}, environment=None, task="Hopper")
+    presets = {name: "sb3" if name == "sb3-sac" else "small" for name in names}
+    read = {name: reads_partial_alone(replace(spec, algorithm=name, overrides={}, preset=presets[name])) for name in names}
+    assert [name for name in names if not read[name]] == ["sac-full", "sb3-sac"]
+    seeing = {"role_keys": {"learner": ["partial", "privileged"]}}
+    for overrides in (seeing, {"policy_kwargs": seeing, "role_keys": None}):
+        assert not reads_partial_alone(replace(spec, algorithm="gac", overrides=overrides))
 
 
 @pytest.mark.parametrize(

@@ -41,8 +41,14 @@ def test_trials_are_kept_and_a_table_printed(tmp_path, monkeypatch, capsys):
     (row,) = json.loads(out.with_suffix(".json").read_text())["trials"]
     assert (row["contender"], row["delay"], row["steps"]) == ("lru", 1, 2)
     assert "| lru | (0." in capsys.readouterr().out
-    monkeypatch.setattr(delay.multiprocessing, "get_context", lambda kind: pytest.fail("trials were made again"))
+    with monkeypatch.context() as context:
+        context.setattr(delay.multiprocessing, "get_context", lambda kind: pytest.fail("trials were made again"))
+        delay.main()
+    monkeypatch.setattr("sys.argv", ["delay", "--delays", "2", "--seeds", "1", "--steps", "2", "--out", str(out)])
     delay.main()
+    trials = json.loads(out.with_suffix(".json").read_text())["trials"]
+    assert [trial["delay"] for trial in trials] == [1, 2], "those of other delays stay"
+    assert trials[0] == row
 
 
 def test_the_table_has_steps_or_the_share_of_right_answers():

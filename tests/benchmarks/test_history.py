@@ -7,7 +7,7 @@ import yaml
 
 from benchmarks.config import check_runs
 from benchmarks.environments import environment, make_envs
-from benchmarks.finished import kind_of, names_of, particulars_of, settings_of
+from benchmarks.finished import is_finished, kind_of, names_of, particulars_of, settings_of
 from benchmarks.suite import read_suite
 from tests.benchmarks.helpers import SMALL_SUITE
 
@@ -43,7 +43,7 @@ def test_a_run_that_was_made_before_there_were_histories_counts(tmp_path):
     (directory / "evaluations.csv").touch()
     before = {key: value for key, value in asdict(spec).items() if key != "history"}
     (directory / "config.yaml").write_text(yaml.safe_dump({"run": before}))
-    assert spec.is_finished(tmp_path)
+    assert is_finished(spec, tmp_path)
 
 
 @pytest.mark.parametrize("history", [1, 0, -2, 1.5, "4", True, None])

@@ -220,7 +220,7 @@ def test_steps_of_needed_runs_are_told_apart_and_counted(launched, tmp_path, mon
     results = json.loads(out.with_suffix(".json").read_text())
     assert [cell.get("needed_steps") for cell in results["cells"]] == [40, None]
     assert results["particulars"]["taught, Pendulum, noise 0.1"]["needs"] == OWN["taught"]["needs"]
-    counted, _ = finished_runs(path, tmp_path, reuse=[out])
+    counted, *_ = finished_runs(path, tmp_path, reuse=[out])
     assert [run.evaluations.columns.tolist().count("needed_steps") for run in counted] == [0, 0], "it is added again"
     pd.testing.assert_frame_equal(benchmarks.aggregate.collect(counted), table, check_dtype=False, check_like=True)
 
@@ -309,6 +309,23 @@ def test_a_job_waits_until_what_it_needs_has_ended_though_there_is_room(three):
 
     launch(three, 2, 0, Engine())
     assert ended == ["other", "teacher", "student"]
+
+
+@pytest.mark.parametrize(
+    ("index", "needed", "message"),
+    [
+        (0, ["nosuch"], r"--needed: taught needs no run as 'nosuch'; it needs runs as \['teacher'\]\."),
+        (0, ["teacher", "nosuch"], r"--needed: sac-full needs no run as 'nosuch'; it needs no other run\."),
+        (1, ["teacher"], r"--needed: sac-asym needs no run as 'teacher'; it needs no other run\."),
+    ],
+)
+def test_a_needed_run_that_there_is_not_is_named(index, needed, message, tmp_path, monkeypatch):
+    path = _suite(tmp_path, CELL | {"algorithms": ["taught", "sac-asym"]})
+    words = ["run", "--suite", str(path), "--index", str(index), "--runs", str(tmp_path / "runs"), "--needed", *needed]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit, match=message):
+        benchmarks.run.main()
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_run_by_itself_says_what_it_needs(tmp_path):

@@ -2,10 +2,12 @@
 
 import pytest
 
-from benchmarks.page.document import normalised_returns
+from benchmarks.page.document import _about_intervals, normalised_returns
 from benchmarks.page.plots import over_seconds, plots
-from benchmarks.page.summary import in_short, listed, what_was_compared
+from benchmarks.page.summary import in_short, listed, seeds_compared, what_was_compared
 from benchmarks.page.tables import differences_table, overall_table, returns_table
+from benchmarks.report import cells_table
+from benchmarks.report import overall_table as markdown_over_all
 from tests.benchmarks.test_report import _tidy
 
 
@@ -20,12 +22,12 @@ def _cell(algorithm, final, noise=0.1, **more):
     }
 
 
-def _results(low=0.6, final=(3.0, 5.0, 7.0), **more):
+def _results(low=0.6, final=(3.0, 5.0, 7.0), seeds=3, **more):
     cells = [
-        _cell("gac", list(final)),
-        _cell("sac", [1.0, 2.0, 3.0]),
-        _cell("gac", [1.0, 1.0, 1.0], 0.3),
-        _cell("sac", [2.0] * 3, 0.3),
+        _cell("gac", (list(final) * 4)[:seeds]),
+        _cell("sac", ([1.0, 2.0, 3.0] * 4)[:seeds]),
+        _cell("gac", [1.0] * seeds, 0.3),
+        _cell("sac", [2.0] * seeds, 0.3),
     ]
     scales = [{"task": "T", "noise": noise, "low": 1.0, "high": 5.0} for noise in (0.1, 0.3)]
     return {
@@ -46,9 +48,37 @@ def test_who_comes_first_and_how_sure_that_is():
     highest, overall, seeds = in_short(_results())
     assert highest == "gac has the highest mean return at the end in 1 of 2 cells, sac in 1."
     assert "gac comes first and sac second (interquartile mean of normalised returns 0.90 and 0.50)" in overall
-    assert overall.endswith("with probability 0.80 (95% interval 0.60 to 0.90), beyond chance.")
+    assert overall.endswith("with probability 0.80: 3 seeds of each can't tell whether that is more than chance.")
     assert seeds == "3 seeds are few: an interval of their mean is 4.3 standard errors to either side (Student's t)."
-    assert in_short(_results(low=0.4))[1].endswith("which these runs can't tell from chance.")
+    assert in_short(_results(seeds=5))[1].endswith("with probability 0.80 (95% interval 0.60 to 0.90), beyond chance.")
+    assert in_short(_results(low=0.4, seeds=5))[1].endswith("which these runs can't tell from chance.")
+
+
+@pytest.mark.parametrize(("seeds", "said"), [(1, "1 seed of"), (2, "2 seeds of"), (4, "4 seeds of"), (5, "beyond chance")])
+def test_fewer_than_five_seeds_give_no_verdict(seeds, said):
+    """The bootstrap's interval of two equal algorithms leaves 0.5 out in 17 to 20% of all cases with three seeds."""
+    results = _results(seeds=seeds)
+    overall = in_short(results)[1]
+    assert said in overall
+    assert ("beyond chance" in overall) == (seeds == 5)
+    assert ("95% interval" in overall) == (seeds == 5)
+    results["cells"][1]["seeds"] = results["cells"][1]["seeds"][:4]
+    assert "beyond chance" not in in_short(results)[1], "as many runs of each count as the fewest are"
+    assert seeds_compared(results) == min(seeds, 4)
+
+
+def test_of_one_seed_there_is_no_interval():
+    one, three = (overall_table(_results(seeds=seeds)) for seeds in (1, 3))
+    assert "<td class=short-text>one seed</td>" in one
+    assert "0.70 to 1.10" not in one
+    assert '<td class=number data-value="0.8">0.80</td>' in one
+    assert "<td class=short-text>0.70 to 1.10</td>" in three
+    assert "0.90 [0.70, 1.10]" in markdown_over_all(_results(seeds=2))
+    assert "[" not in markdown_over_all(_results(seeds=1)).replace("estimate [95%]", "")
+    assert "| 5.40 [1.00, 9.00] |" in cells_table([_cell("gac", [5.0, 5.0])])
+    assert "| 5.40 |" in cells_table([_cell("gac", [5.0])])
+    assert "Those of 2 seeds are too narrow for a verdict." in _about_intervals(_results(seeds=2))
+    assert _about_intervals(_results(seeds=1)) == _about_intervals(_results(seeds=5)) == ""
 
 
 def test_what_is_missing_is_said_and_many_seeds_need_no_word():

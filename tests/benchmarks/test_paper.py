@@ -1,5 +1,6 @@
 """The paper's figures and tables by number: what is drawn, of which runs, and that our numbers are the paper's."""
 
+import json
 import re
 
 import matplotlib
@@ -7,6 +8,7 @@ import pandas as pd
 import pytest
 from matplotlib import pyplot as plt
 
+from benchmarks.finished import name_of
 from benchmarks.paper import __main__ as program
 from benchmarks.paper import figures
 from benchmarks.paper.figures import SCALES, Figure, Group, draw, needs, read_figures
@@ -79,7 +81,45 @@ def test_every_figure_is_drawn_at_once_or_has_no_results_yet(number, tmp_path, c
     assert all(f"benchmarks/suites/{name}.yml: " in told for name in suites)
     has_results = any((figures.RESULTS / f"{name}.csv").exists() for name in suites)
     assert out.exists() == has_results
+    assert ("Drawn so far:" in told) == has_results
     assert ("There is nothing to draw yet." in told) == (not has_results)
+
+
+@pytest.mark.parametrize("number", sorted(FIGURES))
+def test_what_differs_from_the_paper_is_said_of_all_that_is_drawn(number):
+    """Networks, learning rates and the form of GAC, as the results record them; and games, where not all are drawn."""
+    figure = FIGURES[number]
+    said = " ".join(figure.differs)
+    for group in figure.groups["two-cores"]:
+        for name in group.suites:
+            path = figures.RESULTS / f"{name}.json"
+            recorded = json.loads(path.read_text())["arguments"] if path.exists() else {}
+            wanted = {
+                kind: one for kind, one in recorded.items() if kind.split(",")[0] in (group.algorithms or [kind.split(",")[0]])
+            }
+            for kind, arguments in wanted.items():
+                assert f"{arguments['learning_rate']:g}" in said, kind
+                assert str(arguments["policy_kwargs"]["net_arch"][0]) in said, kind
+                if kind.startswith("gac"):
+                    assert ("residual guider" in said) == (arguments.get("guider", "residual") == "residual"), kind
+    assert ("20 times as fast" in said) == any("tgrl-scaled" in group.algorithms for group in figure.groups["two-cores"])
+
+
+def test_cells_and_seeds_that_are_drawn_are_those_of_the_results(tmp_path, monkeypatch, capsys):
+    first, second = figures.cells_drawn(FIGURES[2], "two-cores")
+    assert "RepeatPreviousMedium" in second
+    assert "RepeatPreviousMedium" not in first
+    assert first.count("Easy") == second.count("Easy") == 5
+    assert all(cells.endswith(": 3 seeds of each algorithm") for cells in (first, second))
+    monkeypatch.setattr(figures, "RESULTS", tmp_path)
+    _save(tmp_path, "one")
+    table = pd.read_csv(tmp_path / "one.csv")
+    table[(table.seed == 0) | (table.algorithm == "gac")].to_csv(tmp_path / "one.csv", index=False)
+    groups = {"two-cores": [Group(["one"]), Group(["one"], algorithms=["sac"], noises=[0.1]), Group(["none"])]}
+    cells = ["T, noise 0.1; T, noise 0.3: 1 to 2 seeds of each algorithm", "T, noise 0.1: 1 seed of each algorithm"]
+    assert figures.cells_drawn(Figure(0, "title", groups, []), "two-cores") == cells
+    program.show(Figure(0, "title", {"two-cores": []}, ["nothing"]), "two-cores", tmp_path / "figure.png")
+    assert "Drawn so far" not in capsys.readouterr().out
 
 
 def test_means_are_thick_seeds_thin_and_cells_in_order(drawn, tmp_path):
@@ -127,11 +167,30 @@ def test_what_runs_it_takes_is_said(tmp_path, monkeypatch):
     assert needs("baselines-taught").startswith("36 runs of 12,500 steps, ")
     monkeypatch.setattr(figures, "RESULTS", tmp_path)
     assert needs("paper/figure-7") == "120 runs of 2,000,000 steps, none of them made yet"
-    (tmp_path / "hopper.json").write_text('{"still_to_run": ["a"], "seconds_per_run": {"median": 120.0}}')
-    assert needs("hopper").endswith("8 of them made in 2 minutes of a core each (median)")
+    names = [name_of(spec) for spec in read_suite(figures.SUITES / "hopper.yml")]
+    held = {"runs": {name: {} for name in [*names[:6], "of/another/suite"]}, "seconds_per_run": {"median": 120.0}}
+
+    def said(**more):
+        (tmp_path / "hopper.json").write_text(json.dumps(held | more))
+        return needs("hopper").removeprefix("9 runs of 100,000 steps, ")
+
+    made = "6 of them made in 2 minutes of a core each (median)"
+    assert said(still_to_run=names[8:]) == made, "what the results hold, not what they do not miss"
+    assert (
+        said(set_aside={name: {} for name in names[6:8]})
+        == f"{made}, 2 set aside, since other runs of their cells are missing"
+    )
+    assert said(runs={name: {} for name in names}, seconds_per_run={}) == "all made"
 
 
-def test_run_launches_and_aggregates_all_suites_of_the_scale(tmp_path, monkeypatch):
+def test_the_number_of_runs_is_that_of_the_committed_table():
+    """Five games of three algorithms and three seeds are in the table; the suite has fifteen games."""
+    assert "135 runs of 20,000 steps, 45 of them made" in needs("popgym")
+
+
+@pytest.mark.parametrize("committed", [(), ("baselines",)])
+def test_run_launches_and_aggregates_all_suites_of_the_scale(committed, tmp_path, monkeypatch):
+    """Runs that committed results hold are neither made again nor lost from these results."""
     commands, status = [], iter([0, 0, 0, 0, 3])
 
     class Ended:
@@ -140,6 +199,9 @@ def test_run_launches_and_aggregates_all_suites_of_the_scale(tmp_path, monkeypat
             self.returncode = next(status)
 
     monkeypatch.setattr(program.subprocess, "run", Ended)
+    monkeypatch.setattr(program, "RESULTS", tmp_path)
+    for name in committed:
+        (tmp_path / f"{name}.json").touch()
     with pytest.raises(SystemExit, match=r"baselines-on-policy: launch ended with status 3\. The same command goes on\."):
         program.make(["first-figure", "baselines", "baselines-on-policy"], 2)
     suites = [str(figures.SUITES / f"{name}.yml") for name in ("first-figure", "baselines", "baselines-on-policy")]
@@ -148,9 +210,12 @@ def test_run_launches_and_aggregates_all_suites_of_the_scale(tmp_path, monkeypat
         "benchmarks.aggregate",
         suites[0],
         "--out",
-        str(figures.RESULTS / "first-figure"),
+        str(tmp_path / "first-figure"),
         "--complete-cells",
     ]
+    reuse = ["--reuse-results", str(tmp_path / "baselines")] if committed else []
+    assert commands[2] == ["benchmarks.launch", suites[1], "--jobs", "2", *reuse]
+    assert commands[3][-len(reuse) - 1 :] == ["--complete-cells", *reuse]
     assert commands[4] == ["benchmarks.launch", suites[2], "--jobs", "2"]
 
 

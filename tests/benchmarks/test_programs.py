@@ -31,7 +31,17 @@ from benchmarks.checkpoint import SB3Checkpoints, checkpoints_of
 from benchmarks.config import check_runs, read_algorithm, resolve
 from benchmarks.environments import environment
 from benchmarks.external import Program
-from benchmarks.finished import as_json, from_json, kind_of, name_of, names_of, particulars_of, read_reused, settings_of
+from benchmarks.finished import (
+    as_json,
+    from_json,
+    is_finished,
+    kind_of,
+    name_of,
+    names_of,
+    particulars_of,
+    read_reused,
+    settings_of,
+)
 from benchmarks.launch import jobs_left
 from benchmarks.run import Stopwatch, run
 from benchmarks.suite import RunSpec, made_with, read_suite
@@ -172,16 +182,16 @@ def test_runs_without_their_directories_count_by_the_results_that_they_went_into
     shutil.copytree(runs / names[0], elsewhere / names[0])
     table = pd.read_csv(elsewhere / names[0] / "evaluations.csv")
     table.assign(learner=7.0).to_csv(elsewhere / names[0] / "evaluations.csv", index=False)
-    counted, missing = finished_runs(SMOKE, elsewhere, reuse=[made])
+    counted, missing, _ = finished_runs(SMOKE, elsewhere, reuse=[made])
     assert [run.name for run in counted] == names
     assert not missing
     assert (counted[0].evaluations.learner == 7.0).all(), "a directory comes before what was made earlier"
     table = pd.read_csv(made.with_suffix(".csv"))
     table.assign(learner=8.0).to_csv(tmp_path / "later.csv", index=False)
     shutil.copy(made.with_suffix(".json"), tmp_path / "later.json")
-    counted, _ = finished_runs(SMOKE, elsewhere, reuse=[made, tmp_path / "later"])
+    counted, *_ = finished_runs(SMOKE, elsewhere, reuse=[made, tmp_path / "later"])
     assert [run.evaluations.learner.iloc[0] for run in counted] == [7.0, 8.0, 8.0, 8.0], "the last of several counts"
-    _, missing = finished_runs(SMOKE, runs, True, [made], rerun=["gac"])
+    _, missing, _ = finished_runs(SMOKE, runs, True, [made], rerun=["gac"])
     assert not missing, "directories count in any case"
     with pytest.raises(FileNotFoundError, match=f"1 runs are not finished in .*{names[2]}"):
         finished_runs(SMOKE, elsewhere, reuse=[made], rerun=["gac"])
@@ -224,7 +234,7 @@ def test_former_names_of_options_work_for_one_release_and_are_not_shown(program,
 
 
 def test_hours_are_those_of_the_runs_that_were_timed(runs):
-    counted, _ = finished_runs(SMOKE, runs)
+    counted, *_ = finished_runs(SMOKE, runs)
     some = [run._replace(seconds=seconds) for run, seconds in zip(counted, (None, 1800.0, None, 5400.0), strict=True)]
     record = origins(some)
     assert (record["hours"], record["timed_runs"]) == (2.0, 2)
@@ -593,7 +603,7 @@ def _assert_readable(directory):
 def _assert_finished_as(specs, directory, undisturbed):
     _assert_readable(directory)
     for spec in specs:
-        assert spec.is_finished(directory)
+        assert is_finished(spec, directory)
         read_algorithm(spec.algorithm)[0].load(spec.directory(directory) / "model")
         files, expected = (
             {path.name for path in spec.directory(root).iterdir()} - {"log.txt"} for root in (directory, undisturbed)
@@ -757,9 +767,9 @@ def test_a_run_from_before_it_could_say_how_it_is_evaluated_was_evaluated_by_its
     before = {key: value for key, value in asdict(spec).items() if key != "eval_deterministic"}
     (directory / "config.yaml").write_text(yaml.safe_dump({"run": before, "arguments": resolve(spec)[1]}))
     (directory / "evaluations.csv").write_text("done")
-    assert spec.is_finished(tmp_path)
+    assert is_finished(spec, tmp_path)
     with pytest.raises(ValueError, match=r"other settings under \['eval_deterministic'\]"):
-        replace(spec, eval_deterministic=False).is_finished(tmp_path)
+        is_finished(replace(spec, eval_deterministic=False), tmp_path)
     (directory / "evaluations.csv").unlink()
     with pytest.raises(ValueError, match=r"unfinished run with other settings under \['run'\]"):
         run(replace(spec, eval_deterministic=False), tmp_path)
@@ -820,7 +830,7 @@ def test_results_with_former_names_of_arguments_count(tmp_path):
     specs = _results_of(STDS, tmp_path / "made", lambda spec, arguments: _former(arguments))
     recorded = json.loads((tmp_path / "made.json").read_text())["arguments"]
     assert any("std_of" in arguments for arguments in recorded.values()), "or nothing was tested"
-    counted, missing = finished_runs(STDS, tmp_path, reuse=[tmp_path / "made"])
+    counted, missing, _ = finished_runs(STDS, tmp_path, reuse=[tmp_path / "made"])
     assert not missing
     assert [run.arguments for run in counted] == [resolve(spec)[1] for spec in specs]
 

@@ -1,8 +1,10 @@
 """What the speed benchmark counts and compares."""
 
 import cProfile
+import json
 import multiprocessing
 import pstats
+import sys
 import time
 
 import gymnasium as gym
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 import torch as th
 
+from benchmarks import speed
 from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.models import BASELINES, LoopedGRU, make_baseline_step, recurrent_step_flops, step_flops
 from benchmarks.profiles import cumulative_seconds, env_step, profile_rollout, profile_step
@@ -139,6 +142,32 @@ def test_time_in_a_function_and_all_that_it_calls():
 
 def _calls_slow():
     time.sleep(0.01)
+
+
+def test_a_table_that_is_measured_again_leaves_the_others_in_the_file(tmp_path, monkeypatch):
+    """Each with its own origin; files of earlier versions have one origin for all tables."""
+    old = {"command": "old", "commit": "0", "versions": {"torch": "1"}, "cpus": 2, "threads": 2}
+    (tmp_path / "speed.json").write_text(json.dumps(old | {"steps": [{"a": 1}], "deployment": [{"a": 2}]}))
+    new = {"commit": "1", "versions": {"torch": "2"}, "cpus": 4, "threads": 1}
+    monkeypatch.setattr(speed, "provenance", lambda: new)
+    monkeypatch.setitem(speed.TABLES, "deployment", lambda threads, quick: [{"a": 3}])
+    monkeypatch.setattr(sys, "argv", ["speed", "--tables", "deployment", "--out", str(tmp_path / "speed")])
+    speed.main()
+    record = json.loads((tmp_path / "speed.json").read_text())
+    made_with = record.pop("made_with")
+    assert record == {"steps": [{"a": 1}], "deployment": [{"a": 3}]}
+    assert made_with["steps"] == old
+    assert made_with["deployment"] == new | {"command": "python -m benchmarks.speed --threads 1 2 --tables deployment"}
+    monkeypatch.setitem(speed.TABLES, "steps", lambda threads, quick: [{"a": 4}])
+    monkeypatch.setattr(sys, "argv", ["speed", "--tables", "steps", "--out", str(tmp_path / "speed")])
+    speed.main()
+    again = json.loads((tmp_path / "speed.json").read_text())
+    assert (again["steps"], again["deployment"]) == ([{"a": 4}], [{"a": 3}])
+    assert again["made_with"]["deployment"] == made_with["deployment"]
+    assert again["made_with"]["steps"]["commit"] == "1"
+    monkeypatch.setattr(sys, "argv", ["speed", "--tables", "steps", "--out", str(tmp_path / "of/its/own")])
+    speed.main()
+    assert list(json.loads((tmp_path / "of/its/own.json").read_text())) == ["made_with", "steps"]
 
 
 class Recorder(gym.Wrapper):
