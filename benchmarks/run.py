@@ -34,6 +34,7 @@ from sb3_gac.checkpoint.lock import locked
 from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.presets import instantiate
 from sb3_gac.training.environments import normalized
+from sb3_gac.training.options import TEACHER
 from sb3_gac.training.provenance import provenance
 
 CONFIGURATION, MODEL = "config.yaml", "model.zip"
@@ -184,8 +185,9 @@ def _train(
     :return: one row for each evaluation
     """
     options = configuration.get("normalize")
-    env = normalized(make_envs(spec, spec.envs, spec.seed), options)
-    eval_env = normalized(make_envs(spec, spec.eval_episodes), options, training=False)
+    teacher = models.get(TEACHER)
+    env = normalized(make_envs(spec, spec.envs, spec.seed), options, teacher=teacher)
+    eval_env = normalized(make_envs(spec, spec.eval_episodes), options, training=False, teacher=teacher)
     every = spec.eval_every // spec.envs
     evaluation = _evaluation_class(algorithm_class)(
         eval_env,

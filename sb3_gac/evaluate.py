@@ -27,7 +27,7 @@ import gymnasium as gym
 import torch as th
 from tqdm import tqdm
 
-from sb3_gac.base.loading import load_model, model_file
+from sb3_gac.base.loading import MODEL, load_model, model_file
 from sb3_gac.deploy.statistics import STATISTICS, normalizer_of
 from sb3_gac.envs.table import in_columns
 from sb3_gac.evaluation.episodes import Episode, run_episodes
@@ -144,6 +144,10 @@ def policies_of(options: argparse.Namespace, file: Path) -> tuple[str, dict[str,
             raise ValueError(
                 f"--guider: {file.name} is an exported file, which holds the learner alone. Evaluate the model's zip."
             )
+        if options.vec_normalize is not None:
+            raise ValueError(
+                f"--vec-normalize: {file.name} is an exported file, which has its normalisation in it: leave it out."
+            )
         return f"exported {file.suffix} file", {"learner": load_exported(file)}
     model = load_model(file, options.device)
     makers = {"learner": learner_of, **({"guider": guider_of} if options.guider else {})}
@@ -175,7 +179,7 @@ class Evaluation:
             self.environment.make(setting).close()  # raises where a value is wrong, before the first episode
         if options.video is not None:
             self._drawable(UNDISTURBED, check=True).close()
-        self.directory = options.out or self.file.parent / "evaluation"
+        self.directory = options.out or self.file.parent / _folder_for(self.file)
         _make_folder("--out", self.directory)
         if options.video is not None:
             _make_folder("--video", options.video.parent)
@@ -192,8 +196,8 @@ class Evaluation:
         """Evaluate, and print the table as it grows."""
         reads = (f"The {name} reads {' and '.join(policy.entries)}." for name, policy in self.policies.items())
         print(f"{self.title}. {' '.join(reads)}")
-        if not self.environment.has_noise:
-            print(f"Noise comes on top of what {self.environment.env_id} has of its own.")
+        if beside := self.environment.beside:
+            print(f"Settings come on top of what {self.environment.env_id} has of its own: {' and '.join(beside)}.")
         undisturbed: dict[str, list[Episode]] = {}
         for setting in self.settings:
             self.outcomes[setting] = {}
@@ -275,6 +279,13 @@ class Evaluation:
         if check:
             check_can_film(env, self.environment.env_id)
         return env
+
+
+def _folder_for(file: Path) -> str:
+    """Name of the folder of a file's evaluations, so that those of several files in one folder do not replace each other's."""
+    if file.name == MODEL:
+        return "evaluation"
+    return f"evaluation-{file.stem if file.suffix == '.zip' else file.name}"
 
 
 def _make_folder(option: str, folder: Path) -> None:

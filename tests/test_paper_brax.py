@@ -142,10 +142,11 @@ def test_runs_of_a_suite_have_the_presets_normalisation_unless_their_algorithm_s
 
 def test_a_teacher_that_saw_normalised_observations_is_refused_where_there_are_none():
     keys = {"actor": ["partial", "privileged"]}
-    teacher = small_model(_normalized(DummyVecEnv([TwoViewBandit])), cls=AsymmetricSAC, role_keys=keys).learn(20)
+    env = _normalized(DummyVecEnv([TwoViewBandit]))
+    teacher = small_model(env, cls=AsymmetricSAC, role_keys=keys).learn(20)
     with pytest.raises(ValueError, match=r'"partial" that was normalised by VecNormalize, but env gives it raw: wrap env'):
         small_model(TwoViewBandit(), cls=TGRL, teacher=teacher)
-    assert small_model(_normalized(DummyVecEnv([TwoViewBandit])), cls=TGRL, teacher=teacher).learn(20).frozen
+    assert small_model(env, cls=TGRL, teacher=teacher).learn(20).frozen
 
 
 def test_a_preset_may_be_over_another(tmp_path, monkeypatch):

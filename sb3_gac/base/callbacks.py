@@ -13,6 +13,20 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_gac.checks.arguments import constructor_arguments
+
+#: Argument -> what to do with it where guider and learner are apart
+_ADVICE = {
+    "guider": 'use guider="residual"',
+    "max_kl": "set a hard bound by max_kl",
+    "kl_coef_bounds": "widen kl_coef_bounds",
+    "kl_coef_learning_rate": "raise kl_coef_learning_rate",
+    "largest_kl_coef": "raise largest_kl_coef",
+    "target_kl": "lower target_kl",
+    "behaviour": "give the learner more of the episodes by behaviour",
+    "guidance": "pull it by guidance",
+    "see more": "let it see more (a history, a memory)",
+}
 _WATCHED = ("train/kl", "train/target_kl", "train/kl_coef", "train/kl_coef_on_bound", "train/learner_mean_abs")
 
 
@@ -177,21 +191,31 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
             "kl": (
                 kl > 2 * target_kl,
                 f"KL(guider || learner) is {kl:.2g} for a target of {target_kl:.2g}: the learner does not keep up. "
-                'Use guider="residual", set a hard bound by max_kl, widen kl_coef_bounds, or raise kl_coef_learning_rate.',
+                + self._advice("guider", "max_kl", "kl_coef_bounds", "kl_coef_learning_rate", "largest_kl_coef"),
             ),
             "bound": (
                 self._watched.get("train/kl_coef_on_bound", 0.0) > 0.5,
                 f"kl_coef sits on a bound ({kl_coef:.2g}), and KL is {kl:.2g} for a target of {target_kl:.2g}. "
-                + ("Widen kl_coef_bounds." if kl > target_kl else "The guider wants nothing that the learner does not do."),
+                + (
+                    self._advice("kl_coef_bounds", "largest_kl_coef")
+                    if kl > target_kl
+                    else "The guider wants nothing that the learner does not do."
+                ),
             ),
             "gap": (
                 gap > self.gap_tolerance * abs(guider_returns.mean()) + 2 * noise,
                 f"the guider returns {guider_returns.mean():.5g} and the learner {learner_returns.mean():.5g}: the learner "
-                "can't do what the guider does. Lower target_kl, give the learner more of the episodes by behaviour, pull it "
-                "by guidance, or let it see more (a history, a memory).",
+                "can't do what the guider does. " + self._advice("target_kl", "behaviour", "guidance", "see more"),
             ),
         }
         for name, (is_so, message) in found.items():
             self._in_a_row[name] = self._in_a_row[name] + 1 if is_so else 0
             if self._in_a_row[name] == self.patience:
                 warnings.warn(f"After {self.num_timesteps} steps, {message}", stacklevel=2)
+
+    def _advice(self, *names: str) -> str:
+        """A sentence of what to change, of those arguments that the algorithm has."""
+        known = [*constructor_arguments(type(self.model)), "see more"]
+        *words, last = [_ADVICE[name] for name in names if name in known] or ["change another setting"]
+        text = f"{', '.join(words)}{',' * (len(words) > 1)} or {last}" if words else last
+        return f"{text[0].upper()}{text[1:]}."

@@ -90,8 +90,11 @@ class ExactCheckpointCallback(BaseCallback):
         )
 
     def _save_after_all(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
-        """Save after Ctrl-C in a terminal, which ends the environments' processes as well: the step can't be finished."""
-        if isinstance(error, EnvironmentFailedError) and self._caught is not None:
+        """
+        Save once ``learn`` has stopped at the step's end. Ctrl-C in a terminal ends the environments' processes as well: then
+        the step can't be finished.
+        """
+        if self._caught is not None and (error is None or isinstance(error, EnvironmentFailedError)):
             self._end_process(self._caught)
 
     def _on_rollout_start(self) -> None:
@@ -126,7 +129,7 @@ class ExactCheckpointCallback(BaseCallback):
         raise SystemExit(128 + number)
 
     def _on_step(self) -> bool:
-        return True
+        return self._caught is None
 
     def _release_signals(self) -> None:
         for number, handler in self._handlers.items():

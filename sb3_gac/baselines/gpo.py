@@ -274,5 +274,7 @@ class GPOPenalty(GPO):
     def train(self) -> None:
         """The gradient steps of :meth:`AsymmetricOnPolicyAlgorithm.train`, and then a step of the KL's weight."""
         super().train()
+        self.logger.record("train/target_kl", self.target_kl)
+        self.logger.record("train/kl_coef_on_bound", self.coefficients["kl_coef"].at_bound().item())
         above = th.tensor(self._last_metrics["kl"] > self.target_kl, device=self.device)
         self.coefficients["kl_coef"].move(above)  # type: ignore[union-attr]

@@ -83,6 +83,24 @@ def inputs_apart(then: Scales, now: Scales, entries: Iterable[str]) -> tuple[str
     return None
 
 
+def check_is_of_training(model: Any, now: Scales, entries: Iterable[str], what: str) -> None:
+    """
+    Check that a model's deployed observations are to be normalised as those of its training were.
+
+    :param model: trained model
+    :param now: scales of the normalisation that is given
+    :param entries: observation entries that the policy reads
+    :param what: name of what gives the normalisation, for the message
+    :raises ValueError: naming an entry whose statistics are others
+    """
+    found = inputs_apart(scales_in_training(model), now, entries)
+    if found is not None:
+        raise ValueError(
+            f'{what} has other statistics of "{found[0]}" than the VecNormalize that the model was trained with: what the '
+            f"policy sees would be {found[1]:.1f} standard deviations off. Give the statistics that were saved with the model."
+        )
+
+
 def check_same_statistics(name: str, entries: Iterable[str], then: Scales, env: VecEnv | None) -> None:
     """
     Check that environments normalise observations as a policy's training did.

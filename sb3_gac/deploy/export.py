@@ -18,7 +18,7 @@ from torch import nn
 
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.checks.entries import computable
-from sb3_gac.checks.scale import entries_normalised_in_training
+from sb3_gac.checks.scale import check_is_of_training, entries_normalised_in_training
 from sb3_gac.checks.spaces import index_bounds
 from sb3_gac.checks.values import check_integer
 from sb3_gac.deploy.normalization import DeploymentNormalizer
@@ -130,8 +130,7 @@ def export_learner(
     :return: path of the file
     :raises ValueError: if the suffix is another, ``verify_on`` is no integer above 0, a unit is for an entry that the policy
         does not read, the model learned under a ``VecNormalize`` that it does not have any more, a wrapper outside of
-        ``VecNormalize`` changes the observations, or ``normalizer`` normalises other entries than those that the policy read
-        normalised in training
+        ``VecNormalize`` changes the observations, or the normaliser has other entries or other statistics than in training
     :raises ImportError: if an ONNX file is wanted, and onnx or onnxruntime is not installed
     :raises ExportError: if the file's actions are not those of ``predict``; no file is then written
     """
@@ -165,6 +164,7 @@ def _normalizer_of(model: AsymmetricAlgorithm) -> DeploymentNormalizer | None:
     if vec_normalize is None:
         return None
     normalizer = DeploymentNormalizer.from_vec_normalize(vec_normalize, keys)
+    check_is_of_training(model, normalizer.scales, keys, "The VecNormalize around the model's environments")
     wrapper = model.wrapper_outside_normalisation
     if wrapper is not None and normalizer.mean:
         raise ValueError(
@@ -191,6 +191,7 @@ def _check_normalizes_as_in_training(normalizer: DeploymentNormalizer, model: As
             f"normalizer changes {changed}, but the policy learned from them as the environment returns them: leave "
             "normalizer out, or make it without them."
         )
+    check_is_of_training(model, normalizer.scales, keys, "normalizer")
 
 
 def describe(module: DeployedModule, algorithm: str, units: dict[str, str]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_gac.checks.scale import Scales
 from sb3_gac.envs.spaces import PARTIAL
 
 
@@ -48,6 +49,11 @@ class DeploymentNormalizer:
             vec_normalize.clip_obs,
         )
 
+    @property
+    def scales(self) -> Scales:
+        """Mean and standard deviation of each entry that is normalised."""
+        return {key: (mean, self._std(key)) for key, mean in self.mean.items()}
+
     def __call__(self, observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
         Normalise an observation.
@@ -57,6 +63,9 @@ class DeploymentNormalizer:
         """
         return {key: self._normalize(key, value) if key in self.mean else value for key, value in observation.items()}
 
+    def _std(self, key: str) -> np.ndarray:
+        return np.sqrt(self.var[key] + self.epsilon)
+
     def _normalize(self, key: str, value: np.ndarray) -> np.ndarray:
-        standardised = (value - self.mean[key]) / np.sqrt(self.var[key] + self.epsilon)
+        standardised = (value - self.mean[key]) / self._std(key)
         return np.clip(standardised, -self.clip_obs, self.clip_obs).astype(np.float32)

@@ -7,7 +7,7 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_gac.checks.scale import entries_normalised_in_training
+from sb3_gac.checks.scale import check_is_of_training, entries_normalised_in_training
 from sb3_gac.deploy.normalization import DeploymentNormalizer
 
 #: Name of the file of ``VecNormalize``'s statistics beside a model, the same as in rl_zoo3
@@ -32,7 +32,9 @@ def normalizer_of(model: Any, file: Path, given: Path | None, entries: Collectio
     if statistics is None:
         return None
     normalised = [key for key in entries if key in (entries_normalised_in_training(model) or ())]
-    return DeploymentNormalizer.from_vec_normalize(_read_statistics(statistics, model, entries), normalised)
+    normalizer = DeploymentNormalizer.from_vec_normalize(_read_statistics(statistics, model, entries), normalised)
+    check_is_of_training(model, normalizer.scales, normalised, f"--vec-normalize: {statistics}")
+    return normalizer
 
 
 def _statistics_of(model: Any, file: Path, given: Path | None, entries: Collection[str]) -> Path | None:

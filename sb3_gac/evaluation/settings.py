@@ -12,9 +12,11 @@ import numpy as np
 import yaml
 
 from sb3_gac.algorithms import import_path
-from sb3_gac.envs.disturbances import disturb
+from sb3_gac.envs.disturbances import DroppedFrames, SensorDelay, disturb
 from sb3_gac.envs.spaces import PARTIAL
+from sb3_gac.envs.state import layers
 from sb3_gac.envs.suites import SUITES, batch_factory, env_id_of, is_batched, suite_of
+from sb3_gac.envs.wrappers import SensorNoise
 from sb3_gac.training.environments import in_wrappers
 
 CONFIGURATION = "config.yaml"
@@ -91,7 +93,7 @@ class Environment:
         :raises ValueError: if there is no such environment, or its observations have no ``partial``
         """
         values = {ARGUMENTS[name]: value for name, value in setting._asdict().items()}
-        own = {name: value for name, value in values.items() if name in self._parameters}
+        own = {name: value for name, value in values.items() if name in self._own_arguments}
         rendering = {} if render_mode is None else {"render_mode": render_mode}
         env = in_wrappers(self._creator(**{**self.kwargs, **own, **rendering}), self.wrappers)
         entries = getattr(env.observation_space, "spaces", {})
@@ -104,19 +106,45 @@ class Environment:
         """Setting of training, as the environment's arguments or their defaults say."""
         known: dict[str, Any] = {}
         for name, argument in ARGUMENTS.items():
-            default = self._parameters[argument].default if argument in self._parameters else inspect.Parameter.empty
-            value = self.kwargs.get(argument, default)
+            value = self._own_arguments.get(argument, inspect.Parameter.empty)
             if value is inspect.Parameter.empty:
                 continue
             if not isinstance(value, (int, float)):
-                raise ValueError(f"{argument} of {self.env_id} must be a number here, for all of partial, got {value!r}.")
+                raise ValueError(
+                    f"{argument} of {self.env_id} is {value!r}, and an evaluation has one number for all of partial: give "
+                    f'one, such as --env-kwargs "{{{argument}: 0.1}}".'
+                )
             known[name] = value
         return Setting(**known)
 
     @property
+    def beside(self) -> list[str]:
+        """
+        What disturbs the sensor beside the setting: arguments that the environment does not have, so that it may have a
+        disturbance of its own, and wrappers in an undisturbed environment that do.
+        """
+        env = self.make(UNDISTURBED)
+        wrappers = [type(layer).__name__ for layer in layers(env) if _disturbs(layer)]
+        env.close()
+        return wrappers or ([] if self.has_noise else ["noise"])
+
+    @property
     def has_noise(self) -> bool:
         """Whether the environment has an argument for sensor noise; if not, noise comes on top of its own."""
-        return ARGUMENTS["noise"] in self._parameters
+        return ARGUMENTS["noise"] in self._own_arguments
+
+    @property
+    def _own_arguments(self) -> Mapping[str, Any]:
+        """Those arguments of the environment that make a setting -> their values in training."""
+        name = self.env_id.rpartition(":")[2]
+        registered = gym.registry[name].kwargs if name in gym.registry else {}
+        defaults = {
+            argument: self._parameters[argument].default for argument in ARGUMENTS.values() if argument in self._parameters
+        }
+        given = {
+            argument: value for argument, value in {**registered, **self.kwargs}.items() if argument in ARGUMENTS.values()
+        }
+        return {**defaults, **given}
 
     @property
     def _creator(self) -> Callable[..., gym.Env]:
@@ -148,6 +176,12 @@ class Environment:
         return inspect.signature(made_by).parameters
 
 
+def _disturbs(layer: gym.Env) -> bool:
+    """Whether a layer is a wrapper of this package that changes what the sensor sends."""
+    values = {SensorNoise: "noise_std", SensorDelay: "steps", DroppedFrames: "probability"}
+    return any(isinstance(layer, kind) and np.any(getattr(layer, name) != 0) for kind, name in values.items())
+
+
 def _of_batch(env_id: str) -> Mapping[str, inspect.Parameter]:
     """Parameters of a simulator that steps a batch; it takes noise, some simulators under ``**kwargs``."""
     parameters = dict(inspect.signature(batch_factory(env_id)[0]).parameters)
@@ -170,10 +204,16 @@ def environment_of_run(directory: Path) -> Environment | None:
         return Environment(made["id"], made["kwargs"], made.get("wrappers", ()))
     if made is not None or not {"task", "noise"} <= run.keys():
         return None
-    given = {"noise_std": run["noise"], "history": run.get("history"), "privileged": run.get("privileged")}
+    env_id = env_id_of(run["task"])
+    suite = suite_of(env_id)
+    has_noise = suite is None or SUITES[suite].sensor_noise
+    given = {
+        "noise_std": run["noise"] if has_noise else None,
+        "history": run.get("history"),
+        "privileged": run.get("privileged"),
+    }
     usual = {"history": 1, "privileged": "state"}  # not every environment has these arguments
-    kwargs = {name: value for name, value in given.items() if value not in (None, usual.get(name))}
-    return Environment(env_id_of(run["task"]), kwargs)
+    return Environment(env_id, {name: value for name, value in given.items() if value not in (None, usual.get(name))})
 
 
 def _configuration(path: Path) -> Mapping[str, Any]:

@@ -1,6 +1,7 @@
 """A film of an episode: the simulator, and under it the sensor's measurements beside the values that the policy got."""
 
 from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import gymnasium as gym
 import matplotlib
 import numpy as np
 
-from sb3_gac.envs.camera import no_rendering
+from sb3_gac.envs.camera import CameraImage, no_rendering
 from sb3_gac.envs.disturbances import DroppedFrames, SensorDelay, insert_above, sensor_layer
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
@@ -51,7 +52,9 @@ def tapped(env: gym.Env) -> tuple[gym.Env, Tap, Tap]:
     :return: the environment; a tap of the sensor's values without noise; and a tap of the values that arrive
     """
     arriving = sensor_layer(env)
-    disturbing = [layer for layer in layers(arriving) if isinstance(layer, (SensorNoise, SensorDelay, DroppedFrames))]
+    # What is beneath a camera is not what the camera shows
+    on_the_way = takewhile(lambda layer: not isinstance(layer, CameraImage), layers(arriving))
+    disturbing = [layer for layer in on_the_way if isinstance(layer, (SensorNoise, SensorDelay, DroppedFrames))]
     measured = disturbing[-1].env if disturbing else arriving
     taps: list[Tap] = []
 
@@ -106,11 +109,11 @@ def film(policy: EvaluatedPolicy, env: gym.Env, seed: int, title: str, path: Pat
     for step, (_, _, total) in enumerate(_played(policy, env, seed, measured, got)):
         frame = _composed(np.asarray(env.render()), series, step, f"{title}    step {step}    return {total:.1f}")
         if writer is None:
-            fps = env.unwrapped.metadata.get("render_fps", 30)
+            fps = env.unwrapped.metadata.get("render_fps") or 30
             writer = FFMPEG_VideoWriter(str(path), frame.shape[1::-1], fps)
         writer.write_frame(frame)
     assert writer is not None
-    for _ in range(fps):  # a second to look at the end
+    for _ in range(round(fps)):  # a second to look at the end
         writer.write_frame(frame)
     writer.close()
     return total

@@ -76,9 +76,15 @@ class AdditiveCoefficient(FixedCoefficient):
         return ((self.value <= low) | (self.value >= high)).float()
 
 
+#: Share of its first value below which a coefficient that falls by a factor is 0
+NOTHING = 1e-6
+
+
 class MultiplicativeCoefficient(FixedCoefficient):
     """
     A coefficient that starts at 0, and rises or falls by a factor, without gradients.
+
+    One that has fallen below a millionth of ``first`` is 0 again: it acts on nothing, and from 0 it rises at once.
 
     :param first: value after the first move up from 0
     :param factor: factor by which a move up multiplies, and a move down divides
@@ -100,7 +106,7 @@ class MultiplicativeCoefficient(FixedCoefficient):
         """
         moved = th.where(up, self.value * self.factor, self.value / self.factor)
         risen = th.where(up & (self.value == 0), th.full_like(self.value, self.first), moved)
-        self.value.copy_(risen.clamp(max=self.largest))
+        self.value.copy_(th.where(risen < NOTHING * self.first, th.zeros_like(risen), risen.clamp(max=self.largest)))
 
     def at_bound(self) -> th.Tensor:
         """1 if the coefficient has its largest value, else 0, scalar."""

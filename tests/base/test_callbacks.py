@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, GuiderLearnerEvalCallback, SeededEvalCallback
+from sb3_gac import GAC, AsymmetricSAC, GPOPenalty, GuiderLearnerEvalCallback, SeededEvalCallback
 
 EPISODE_LENGTH = 5
 
@@ -337,9 +337,22 @@ def test_both_policies_act_as_they_are_asked_to(deterministic):
 def test_the_spread_of_either_policys_returns_may_explain_a_gap(whose):
     steady = {"guider": np.full(4, 5.0), "learner": np.full(4, 3.0)}
     callback = _callback(_vec_env(), patience=1)
-    callback.num_timesteps = 1
+    callback.model, callback.num_timesteps = _model(_vec_env()), 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         callback._warn_if_not_following(*(steady | {whose: steady[whose] + np.array([-8, 8, -8, 8])}).values())
     with pytest.warns(UserWarning, match="the guider returns 5 and the learner 3"):
         callback._warn_if_not_following(*steady.values())
+
+
+def test_a_weight_that_holds_nobody_any_more_is_told_of_gpo_in_its_own_words():
+    small = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 8, "batch_size": 8, "device": "cpu", "seed": 0}
+    model = GPOPenalty("MultiInputPolicy", _vec_env(), target_kl=1e-9, largest_kl_coef=0.01, **small)
+    callback = _callback(_vec_env(), eval_freq=8, patience=2, gap_tolerance=1e6)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(200, callback=callback)
+    said = [str(warning.message) for warning in caught if "kl" in str(warning.message)]
+    assert any("the learner does not keep up. Raise largest_kl_coef." in message for message in said)
+    assert any("kl_coef sits on a bound (0.01), and KL" in message and "Raise largest_kl_coef." in message for message in said)
+    assert not any("max_kl" in message or "kl_coef_bounds" in message for message in said)

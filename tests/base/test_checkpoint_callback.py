@@ -63,7 +63,7 @@ def test_an_error_after_a_signal_is_not_hidden_by_it(tmp_path):
     assert _steps(tmp_path) == []
 
 
-def test_a_signal_that_an_earlier_training_did_not_get_to_is_forgotten(tmp_path):
+def test_a_signal_in_the_last_step_ends_the_process_and_not_the_next_training(tmp_path):
     class Signalling(TwoViewBandit):
         def step(self, action):
             if model.num_timesteps == 19:
@@ -72,8 +72,9 @@ def test_a_signal_that_an_earlier_training_did_not_get_to_is_forgotten(tmp_path)
 
     model = small_model(Signalling())
     callback = ExactCheckpointCallback(tmp_path, every=100)
-    with pytest.warns(UserWarning, match="SIGTERM"):
+    with pytest.warns(UserWarning, match="SIGTERM"), pytest.raises(SystemExit, match="143"):
         model.learn(20, callback=callback)
+    assert type(model).resume(tmp_path, Signalling(), device="cpu").num_timesteps == 20
     assert model.learn(20, callback=callback, reset_num_timesteps=False).num_timesteps == 40
 
 

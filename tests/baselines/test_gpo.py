@@ -93,6 +93,20 @@ def test_the_weight_of_the_kl_starts_at_nought_and_moves_by_a_factor():
     assert coefficient.at_bound() == 1
 
 
+def test_a_weight_of_the_kl_that_fell_to_nothing_rises_at_once():
+    """In float32 it would be stuck near 1e-45 after 555 falls, where a fifth more of it is as much as before."""
+    coefficient = MultiplicativeCoefficient(0.1, 1.2, 1.0, th.device("cpu"))
+    coefficient.move(th.tensor(True))
+    seen = []
+    for _ in range(700):
+        coefficient.move(th.tensor(False))
+        seen.append(coefficient.value.item())
+    assert seen[74] == pytest.approx(0.1 / 1.2**75)
+    assert seen[76:] == [0.0] * 624, "from a millionth of its first value on"
+    coefficient.move(th.tensor(True))
+    assert coefficient.value.item() == pytest.approx(0.1)
+
+
 # --- in float64 ------------------------------------------------------------------------------------------------------------
 
 

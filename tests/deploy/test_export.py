@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_gac
 from sb3_gac import GAC, DeploymentNormalizer, OnnxPolicy, export_learner
+from sb3_gac.deploy.__main__ import main as export
 from sb3_gac.deploy.verification import ExportError, draw_observations
 from sb3_gac.envs import History
 from sb3_gac.networks.encoders import VectorExtractor
@@ -466,3 +467,24 @@ def test_a_normalizer_of_what_the_policy_read_raw_is_refused(tmp_path):
     model = _reads_two(env).learn(20)
     with pytest.raises(ValueError, match=r"normalizer changes \['proprio'\], but the policy learned from them as the env"):
         export_learner(model, tmp_path / "learner.pt", DeploymentNormalizer.from_vec_normalize(other, ["partial", "proprio"]))
+
+
+def test_statistics_of_another_training_are_refused(tmp_path):
+    """Of the model's environments, or given, or in a file: what the policy sees would be on another scale."""
+    env = VecNormalize(DummyVecEnv([lambda: Sampled(SEVERAL)]))
+    model = _reads_two(env).learn(20)
+    model.save(tmp_path / "model")
+    env.save(str(tmp_path / "right.pkl"))
+    fresh = VecNormalize(DummyVecEnv([lambda: Sampled(SEVERAL)]))
+    fresh.obs_rms["partial"].mean += 5
+    fresh.save(str(tmp_path / "wrong.pkl"))
+    other = DeploymentNormalizer.from_vec_normalize(fresh, ["partial", "proprio"])
+    loaded = type(model).load(tmp_path / "model", env=fresh, device="cpu")
+    said = r'other statistics of "partial" than the VecNormalize that the model was trained with'
+    for one, given in ((loaded, None), (model, other)):
+        with pytest.raises(ValueError, match=said):
+            export_learner(one, tmp_path / "learner.pt", given)
+    with pytest.raises(SystemExit, match=f"--vec-normalize: .*wrong.pkl has {said}"):
+        export([str(tmp_path / "model.zip"), str(tmp_path / "learner.pt"), "--vec-normalize", str(tmp_path / "wrong.pkl")])
+    assert not (tmp_path / "learner.pt").exists()
+    export_learner(model, tmp_path / "learner.pt")

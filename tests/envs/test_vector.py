@@ -11,10 +11,12 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from sb3_gac import GAC
-from sb3_gac.envs import make_vec
+from sb3_gac.envs import SensorNoise, make_vec
+from sb3_gac.envs.state import layers
 from sb3_gac.envs.suites import SUITES, batch_factory, is_batched, register
 from sb3_gac.envs.vector.single import SingleEnv
 from tests.envs.vector_helpers import Counters, RestorableCounters
+from tests.helpers import small_model
 
 NO_ACTION = np.zeros((3, 1), dtype=np.float32)
 
@@ -330,3 +332,14 @@ def test_where_it_cannot_be_a_checkpoint_says_so_and_keeps_the_settings(tmp_path
     with pytest.warns(UserWarning, match="new episodes.*Counters can't write down its simulator's state"):
         resumed = GAC.resume(tmp_path, Counters(3, noise_std=0.1))
     assert resumed.env.get_attr("noise_std")[0] == 0.5
+
+
+def test_an_attribute_is_set_on_the_layer_that_has_it_without_a_model_as_well():
+    env = make_vec("sb3_gac/Pendulum-v1", 2, seed=0)
+    env.set_attr("noise_std", 0.9)
+    env.set_attr("noise_std", 0.4, indices=1)
+    assert [float(one.get_wrapper_attr("noise_std")) for one in env.envs] == pytest.approx([0.9, 0.4])
+    assert all("noise_std" not in vars(one) for one in env.envs), "not on Monitor"
+    small_model(env).env.set_attr("noise_std", 0.2)
+    found = [layer for one in env.envs for layer in layers(one) if isinstance(layer, SensorNoise)]
+    assert [float(layer.noise_std) for layer in found] == pytest.approx([0.2, 0.2])

@@ -116,6 +116,15 @@ def test_exported_files_do_as_the_model_and_begin_anew_with_each_episode(suffix,
         assert 0 <= result["success"] <= 1
 
 
+def test_evaluations_of_files_in_one_folder_have_folders_of_their_own(tmp_path):
+    model = GAC("MultiInputPolicy", Walk(), **SMALL)
+    model.save(tmp_path / "walk.zip")
+    export_learner(model, tmp_path / "walk.pt", verify_on=4)
+    for file in ("walk.zip", "walk.pt"):
+        main([str(tmp_path / file), "--env", ENV, "--episodes", "1", "--noise", "0"])
+    assert {path.parent.name for path in tmp_path.glob("*/evaluation.json")} == {"evaluation-walk", "evaluation-walk.pt"}
+
+
 def test_a_runs_directory_is_enough(tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()
@@ -142,7 +151,10 @@ def test_the_statistics_of_vec_normalize_count(tmp_path):
     env = VecNormalize(DummyVecEnv([Walk]))
     model = GAC("MultiInputPolicy", env, **SMALL).learn(20)
     model.save(tmp_path / "normalised")
-    env.obs_rms["partial"].mean[:] = 3.0
+    partial = env.obs_rms["partial"]
+    partial.mean += 3 * np.sqrt(partial.var)
+    env.save(str(tmp_path / "far.pkl"))
+    partial.mean -= 2.8 * np.sqrt(partial.var)  # near those of training, and not the same
     env.save(str(tmp_path / "statistics.pkl"))
     options = ("--env", ENV, "--noise", "0")
     with pytest.raises(SystemExit, match="pass --vec-normalize"):
@@ -160,6 +172,7 @@ def test_the_statistics_of_vec_normalize_count(tmp_path):
         "other.pkl": "holds dict, not what VecNormalize.save writes",
         "rewards.pkl": r"rewards\.pkl has no statistics of \['partial', 'privileged'\], which were normalised in training",
         "privileged.pkl": r"privileged\.pkl has no statistics of \['partial'\], which were",
+        "far.pkl": r'far\.pkl has other statistics of "partial" .* would be 3\.0 standard deviations off',
         "foreign.pkl": r"is of another environment: its \"partial\" has the shape \(5,\), and the model's \(2,\)",
     }.items():
         with pytest.raises(SystemExit, match=message):
@@ -229,6 +242,7 @@ def test_what_is_wrong_is_said_before_anything_is_run(gac, tmp_path, monkeypatch
         (asymmetric, *NOISY, "--guider"): "AsymmetricSAC has no guider",
         (tmp_path / "other.pt", *NOISY): "is no TorchScript file",
         (tmp_path / "other.pt", *NOISY, "--guider"): "--guider: other.pt is an exported file",
+        (tmp_path / "other.pt", *NOISY, "--vec-normalize", "x.pkl"): "--vec-normalize: other.pt is an exported file",
         (gac, *NOISY[:2]): r'make the environment as in training, such as by --env-kwargs "\{history: 4\}"',
         (gac, *NOISY, "--noise", "0", "-0.5"): "noise_std must be a finite number >= 0",
         (gac, *NOISY, "--delay", "-1", "1"): "delay: steps must be",

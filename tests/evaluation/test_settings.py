@@ -6,9 +6,10 @@ import pytest
 import yaml
 
 from sb3_gac.envs import DroppedFrames, History, SensorDelay, SensorNoise
+from sb3_gac.envs.disturbances import disturb
 from sb3_gac.envs.state import layers
 from sb3_gac.evaluation.settings import UNDISTURBED, Environment, Setting, check_fits, environment_of_run, plan
-from tests.evaluation.helpers import ENV
+from tests.evaluation.helpers import ENV, Walk
 
 NOISY = "tests.evaluation.helpers:noisy_walk"
 
@@ -54,7 +55,7 @@ def test_what_is_trained_by_default_is_the_environments_default():
     assert Environment("sb3_gac/brax-Ant-v0").trained == Setting(0.1), "known without the simulator"
     assert Environment("sb3_gac/Go1Getup-v0", {"noise_std": 0.2}).trained == Setting(0.2)
     assert Environment("sb3_gac/Go1Getup-v0").has_noise
-    with pytest.raises(ValueError, match=r"noise_std of .* must be a number here.*\[0.1, 0.2\]"):
+    with pytest.raises(ValueError, match=r'noise_std of .* is \[0.1, 0.2\], .* --env-kwargs "{noise_std: 0.1}"'):
         _ = Environment("sb3_gac/Pendulum-v1", {"noise_std": [0.1, 0.2]}).trained
 
 
@@ -106,3 +107,36 @@ def test_what_the_policy_reads_must_be_shown():
         check_fits({"partial": (9,)}, env, ENV)
     with pytest.raises(ValueError, match='reads an entry "goal"'):
         check_fits({"goal": (2,)}, env, ENV)
+
+
+class Taking(gym.Wrapper):
+    """Whatever its maker takes, it takes."""
+
+    def __init__(self, **disturbed):
+        super().__init__(disturb(Walk(), **disturbed))
+
+
+def test_what_an_environment_is_registered_with_is_what_it_was_trained_with():
+    gym.register("tests/Disturbed-v0", entry_point=Taking, kwargs={"noise_std": 0.5, "delay": 3})
+    environment = Environment("tests/Disturbed-v0")
+    assert environment.trained == Setting(0.5, 3)
+    assert _disturbances(environment.make(UNDISTURBED)) == [] == environment.beside
+    (delay,) = _disturbances(environment.make(Setting(0.0, 1)))
+    assert delay.steps == 1, "once, by its own argument"
+    assert Environment("tests/Disturbed-v0", {"delay": 2}).trained == Setting(0.5, 2)
+
+
+def test_disturbances_that_stay_are_named():
+    """A task in wrappers of one's own has them beside those of a setting."""
+    wrappers = [{"sb3_gac.envs:SensorNoise": {"noise_std": 0.5}}, {"sb3_gac.envs:SensorDelay": {"steps": 2}}]
+    assert Environment("sb3_gac/Pendulum-v1", {}, wrappers).beside == ["SensorDelay", "SensorNoise"]
+    assert Environment("sb3_gac/Pendulum-v1").beside == []
+    assert Environment(ENV).beside == ["noise"], "it may have some of its own"
+
+
+@pytest.mark.parametrize("task", ["TigerDoor", "popgym-RepeatPreviousEasy"])
+def test_a_benchmarks_run_of_a_task_without_noise_has_no_argument_for_it(task, tmp_path):
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"run": {"task": task, "noise": 0.0, "history": 1}, "arguments": {}}))
+    environment = environment_of_run(tmp_path)
+    assert environment == Environment(f"sb3_gac/{task}-v0", {})
+    environment.make(UNDISTURBED)

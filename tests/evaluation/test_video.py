@@ -3,15 +3,20 @@
 import json
 import os
 import sys
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from sb3_gac import GAC
 from sb3_gac.envs import DroppedFrames, History, SensorDelay, SensorNoise
+from sb3_gac.envs.camera import CameraImage
+from sb3_gac.envs.wrappers import EntryWrapper
 from sb3_gac.evaluate import main
+from sb3_gac.evaluation.policies import learner_of
 from sb3_gac.evaluation.settings import UNDISTURBED, Environment, Setting
-from sb3_gac.evaluation.video import GOT, MEASURED, PAPER, Tap, _composed, tapped
+from sb3_gac.evaluation.video import GOT, MEASURED, PAPER, Tap, _composed, film, tapped
 from tests.evaluation.helpers import ENV, Walk, noisy_walk
 
 NOISY = "tests.evaluation.helpers:noisy_walk"
@@ -136,3 +141,36 @@ def test_a_film_is_made_where_an_environment_is_made_by_its_id():
     assert not np.allclose(measured.latest, first)
     assert type(measured.env).__name__ == "SplitObservation"
     assert Environment(ENV).make(UNDISTURBED, "rgb_array").render_mode == "rgb_array"
+
+
+def test_what_is_beneath_a_camera_is_not_what_it_shows():
+    """Noise on positions, beneath the camera, is of another shape."""
+
+    class Lens(CameraImage):
+        def __init__(self, env):
+            EntryWrapper.__init__(self, env, "partial")
+            self._set_entry_space(spaces.Box(0, 255, (2, 2, 3), np.uint8))
+
+        def _first(self, value, seed):
+            return np.zeros((2, 2, 3), np.uint8)
+
+        def _next(self, value, action, reward):
+            return np.full((2, 2, 3), self.unwrapped.steps, np.uint8)
+
+    env, measured, got = tapped(SensorDelay(Lens(SensorNoise(Walk(), 0.5)), 2))
+    (true, seen), _ = _stepped(env, (measured, got))
+    assert true.shape == seen.shape == (13, 2, 2, 3)
+
+
+def test_a_film_may_have_a_fraction_of_frames_in_a_second(tmp_path):
+    pytest.importorskip("moviepy")
+
+    class Drawn(Walk):
+        metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 1 / 0.03}
+
+        def render(self):
+            return np.zeros((40, 60, 3), np.uint8)
+
+    policy = learner_of(GAC("MultiInputPolicy", Walk(), **SMALL))
+    film(policy, Drawn(), 0, "noise 0", tmp_path / "film.mp4")
+    assert (tmp_path / "film.mp4").stat().st_size > 0
