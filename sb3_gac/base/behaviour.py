@@ -29,8 +29,8 @@ class Behaviour:
         policy has a fixed part of the environments
     :param frozen: names of frozen policies, which may act as well
     :param n_envs: number of environments
-    :raises ValueError: if a name is no policy's, if shares are not from 0 to 1, if they sum up to less than 1 and no policy
-        is left for the remainder, or if a policy's part of the environments is none at any time
+    :raises ValueError: if a name is no policy's, if shares are not from 0 to 1, or if they sum up to less than 1 and no policy
+        is left for the remainder
     """
 
     def __init__(
@@ -46,11 +46,21 @@ class Behaviour:
         for role in (self.default, *self.shares):
             check_choice("behaviour: a policy", role, (*roles.policies, *frozen))
         self.shares_at(1.0)
-        for role in self.shares if per == "environment" else ():
-            if not self.acts(role) and any(self._share_of(role, moment) > 0 for moment in MOMENTS):
+
+    def check_parts(self) -> None:
+        """
+        Check that each policy with a share has a part of the environments, where shares are such parts.
+
+        :raises ValueError: naming a policy whose part is less than one environment at any time
+        """
+        if not self.shares or self.per == "episode":
+            return
+        parts = {role for moment in MOMENTS for role in self._parts(self.shares_at(moment), self.n_envs)}
+        for role in (*self.shares, *([self.remainder] if self.remainder else [])):
+            if role not in parts and self.acts(role):
                 raise ValueError(
-                    f"behaviour gives {role} a share that is less than one of {n_envs} environments, so {role} would never "
-                    'act: give more environments or a larger share, or leave behaviour_per "episode".'
+                    f"behaviour gives {role} a share that is less than one of {self.n_envs} environments, so {role} would "
+                    'never act: give more environments or a larger share, or leave behaviour_per "episode".'
                 )
 
     def acts(self, role: str) -> bool:
@@ -58,11 +68,8 @@ class Behaviour:
         Whether a policy ever acts; shares are looked at in nine moments of training, at equal distances.
 
         :param role: role of the policy
-        :return: whether its share is above 0 in one of these moments; where shares are parts of the environments, whether its
-            part is one environment at least
+        :return: whether its share is above 0 in one of these moments
         """
-        if self.shares and self.per == "environment":
-            return any(role in self._parts(self.shares_at(moment), self.n_envs) for moment in MOMENTS)
         return any(self._share_of(role, moment) > 0 for moment in MOMENTS)
 
     def _share_of(self, role: str, progress_remaining: float) -> float:

@@ -235,6 +235,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
     # --- learning ---------------------------------------------------------------------------------------------------
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        self.chooses_behaviour.check_parts()
         self._recorded = None if self.recording is None else Recording(self.recording, self.n_envs)
         result = super()._setup_learn(*args, **kwargs)
         assert self.env is not None

@@ -80,23 +80,26 @@ def test_shares_of_all_policies_sum_up_to_one(per):
         small_model(cls=AsymmetricSAC, behaviour={"actor": 0.5})
 
 
-def test_a_share_that_is_no_environment_is_refused():
+def test_a_share_that_is_no_environment_is_refused_where_training_begins():
     for share, n_envs in ((0.25, 1), (0.25, 2), ("linear 0.1 -> 0.2", 2)):
         with pytest.raises(ValueError, match=rf"gives learner a share that is less than one of {n_envs} environments"):
-            Behaviour(ROLES, {"learner": share}, "environment", n_envs=n_envs)
-    late = Behaviour(ROLES, {"learner": "linear 0 -> 1"}, "environment", n_envs=1)
-    assert late.acts("learner")
-    assert late.acts("guider")
-    assert not Behaviour(ROLES, {"learner": 1.0}, "environment", n_envs=3).acts("guider")
-    assert not Behaviour(ROLES, {"learner": 0.9}, "environment", n_envs=2).acts("guider"), "its tenth is none of two"
+            Behaviour(ROLES, {"learner": share}, "environment", n_envs=n_envs).check_parts()
+    with pytest.raises(ValueError, match="gives guider a share that is less than one of 2"):
+        Behaviour(ROLES, {"learner": 0.9}, "environment", n_envs=2).check_parts()
+    for shares, n_envs in (({"learner": "linear 0 -> 1"}, 1), ({"learner": 1.0}, 3), ({"learner": 0.0}, 1), (None, 1)):
+        Behaviour(ROLES, shares, "environment", n_envs=n_envs).check_parts()
+    Behaviour(ROLES, {"learner": 0.25}, "episode", n_envs=1).check_parts()
 
 
-def test_other_environments_are_shared_out_anew():
-    """With too few of them the model is as it was."""
+def test_other_environments_are_shared_out_anew(tmp_path):
+    """A model in too few of them may act and be saved, and does not learn."""
     model = small_model(DummyVecEnv([TwoViewBandit] * 4), behaviour={"learner": 0.25}, behaviour_per="environment")
-    with pytest.raises(ValueError, match="less than one of 1 environments"):
-        model.set_env(DummyVecEnv([TwoViewBandit]))
-    assert model.n_envs == model.chooses_behaviour.n_envs == 4
+    model.save(tmp_path / "model")
+    for alone in (type(model).load(tmp_path / "model", env=DummyVecEnv([TwoViewBandit])), model):
+        alone.set_env(DummyVecEnv([TwoViewBandit]))
+        with pytest.raises(ValueError, match="less than one of 1 environments"):
+            alone.learn(10)
+        assert alone.num_timesteps == 0
     model.set_env(DummyVecEnv([TwoViewBandit] * 8))
     assert model.learn(30).acting == ["learner"] * 2 + ["guider"] * 6
 

@@ -1,5 +1,7 @@
 """COSIL: a student near a teacher that sees more, a weight that holds it there, and no entropy."""
 
+from types import MappingProxyType
+
 import numpy as np
 import pytest
 import torch as th
@@ -86,6 +88,18 @@ def _every_transition():
     return Batch(now, actions[:, None], rewards, later, th.zeros(16), th.tensor(GAMMA))
 
 
+class Known:
+    """A teacher in the place of a frozen policy, which was trained on nothing."""
+
+    entries, scales = (), MappingProxyType({})
+
+    def __init__(self, distribution):
+        self.distribution = distribution
+
+    def __call__(self, obs):
+        return self.distribution(obs)
+
+
 def _known_teacher(obs):
     return Categorical(th.tensor(LOGITS, dtype=th.float32)[obs["partial"].argmax(-1), obs["privileged"][..., 0].long()])
 
@@ -108,7 +122,7 @@ def _optimum(weight):
 
 def _trained_on_two_states(**arguments):
     model = small_model(Sampled(TWO_STATES, spaces.Discrete(2)), COSIL, learning_rate=1e-2, tau=0.1, **arguments)
-    model.frozen["teacher"] = _known_teacher
+    model.frozen["teacher"] = Known(_known_teacher)
     model.learn(1)
     batch = _every_transition()
     model._sample_batch = lambda batch_size: batch
@@ -285,7 +299,9 @@ def test_a_student_of_a_good_teacher_needs_no_reward():
             return observation, 0.0, *rest
 
     model = small_model(Silent(), COSIL, learning_rate=1e-2, batch_size=64, learning_starts=50)
-    model.frozen["teacher"] = lambda obs: TanhGaussian(th.atanh(obs["privileged"]), th.full_like(obs["privileged"], -1.0))
+    model.frozen["teacher"] = Known(
+        lambda obs: TanhGaussian(th.atanh(obs["privileged"]), th.full_like(obs["privileged"], -1.0))
+    )
     model.learn(300)
     targets = np.linspace(-0.7, 0.7, 15, dtype=np.float32)
     actions, _ = model.predict({"partial": np.stack([targets, np.zeros(15, np.float32)], axis=1)}, deterministic=True)
