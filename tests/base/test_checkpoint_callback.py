@@ -6,10 +6,11 @@ import subprocess
 import sys
 
 import pytest
+import torch as th
 from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_gac import GAC, DivergenceError, ExactCheckpointCallback
+from sb3_gac import GAC, DivergenceError, ExactCheckpointCallback, GPOPenalty
 from sb3_gac.checkpoint.files import checkpoints, step_of
 from tests.helpers import TwoViewBandit, small_model
 
@@ -76,6 +77,38 @@ def test_a_signal_in_the_last_step_ends_the_process_and_not_the_next_training(tm
         model.learn(20, callback=callback)
     assert type(model).resume(tmp_path, Signalling(), device="cpu").num_timesteps == 20
     assert model.learn(20, callback=callback, reset_num_timesteps=False).num_timesteps == 40
+
+
+@pytest.mark.parametrize("kind", ["episodes", "rollouts"])
+def test_a_signal_does_not_wait_for_the_end_of_a_rollout(kind, tmp_path):
+    """And training goes on as if there had been none."""
+
+    def made(env):
+        if kind == "episodes":
+            return small_model(env, train_freq=(1, "episode"))
+        return GPOPenalty("MultiInputPolicy", env, policy_kwargs={"net_arch": [8]}, n_steps=64, batch_size=16, seed=0)
+
+    class Signalling(TwoViewBandit):
+        def __init__(self):
+            super().__init__(length=40)
+
+        def step(self, action):
+            if self.signals and model.num_timesteps == 12:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return super().step(action)
+
+    Signalling.signals, model = False, None
+    undisturbed = made(Signalling())
+    undisturbed.learn(128)
+    Signalling.signals, model = True, made(Signalling())
+    with pytest.warns(UserWarning, match="SIGTERM"), pytest.raises(SystemExit, match="143"):
+        model.learn(128, callback=ExactCheckpointCallback(tmp_path, every=100))
+    assert model.num_timesteps == 13
+    Signalling.signals = False
+    resumed = type(model).resume(tmp_path, Signalling(), device="cpu")
+    resumed.learn(resumed.steps_left, reset_num_timesteps=False)
+    for one, other in zip(resumed.policy.parameters(), undisturbed.policy.parameters(), strict=True):
+        assert th.equal(one, other)
 
 
 @pytest.mark.parametrize("argument", ["every", "keep"])
