@@ -231,6 +231,12 @@ def test_a_teachers_statistics_are_its_students(tmp_path):
     for key in ("partial", "privileged"):
         np.testing.assert_array_equal(shown[key].mean, seen[key].mean)
         assert shown[key].count == seen[key].count > 400
+    configuration = student / "config.yaml"
+    assert yaml.safe_load(configuration.read_text())["normalize"] == "teacher"
+    (student / "results.json").unlink()  # as if it were unfinished
+    assert parse_arguments(["--resume", str(student)]).normalize == "teacher"
+    configuration.write_text(configuration.read_text().replace("normalize: teacher", "normalize: true"))
+    assert parse_arguments(["--resume", str(student)]).normalize is True, "of an earlier version: its own statistics"
 
 
 def test_observations_are_normalised_on_request(tmp_path):

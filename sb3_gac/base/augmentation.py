@@ -3,9 +3,10 @@
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_gac.math.images import random_shift
 from sb3_gac.replay.samples import SequenceSamples
@@ -25,12 +26,6 @@ def shifted_entries(space: spaces.Dict, keys: Iterable[str], pixels: int) -> tup
         return ()
     keys = list(keys)
     images = tuple(key for key in keys if is_image_space(space[key], normalized_image=True))
-    channels_last = [key for key in images if not is_image_space_channels_first(space[key])]  # type: ignore[arg-type]
-    if channels_last:  # SB3 brings images of uint8 into this order, and no others
-        raise ValueError(
-            f"random_shift={pixels} needs images with their channels first, and {channels_last} have them last: transpose "
-            "them where they are made, or make them of type uint8."
-        )
     if not images:
         raise ValueError(
             f"random_shift={pixels} shifts images, but the deployed policy reads {keys}, of which none is: leave it 0."
@@ -39,6 +34,23 @@ def shifted_entries(space: spaces.Dict, keys: Iterable[str], pixels: int) -> tup
         if pixels >= min(space[key].shape[-2:]):  # type: ignore[index]
             raise ValueError(f'random_shift={pixels} leaves nothing of the entry "{key}", which is {space[key]}: lower it.')
     return images
+
+
+def check_channels_first(space: spaces.Dict, images: Iterable[str], pixels: int) -> None:
+    """
+    Check that a shift goes over the heights and widths of images.
+
+    :param space: observation space of the environment
+    :param images: names of the images that are to be shifted
+    :param pixels: value of the argument ``random_shift``, in pixels
+    :raises ValueError: naming images whose last dimension is the smallest, so that it must be that of their channels
+    """
+    last = [key for key in images if np.argmin(space[key].shape) == 2]  # type: ignore[arg-type]
+    if last:  # SB3 brings images of uint8 into the other order, and no others
+        raise ValueError(
+            f"random_shift={pixels} needs images with their channels first, and {last} seem to have them last, by shape. "
+            "Transpose them where they are made, or make them of type uint8."
+        )
 
 
 def shifted(samples: Any, keys: Iterable[str], pixels: int) -> Any:

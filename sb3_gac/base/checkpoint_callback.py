@@ -20,7 +20,7 @@ _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 class ExactCheckpointCallback(BaseCallback):
     """
-    Save checkpoints before rollouts start, the moment from which a resumed run is the same to the bit.
+    Save checkpoints before rollouts start, and on signals after a step; a resumed run is the same to the bit from either.
 
     The callback calls :meth:`ResumableAlgorithm.save_checkpoint`, on a schedule and on signals. SIGTERM, which pre-empting
     schedulers send, and Ctrl-C have the step finished and a checkpoint written. Then the process ends with a message that
@@ -129,7 +129,8 @@ class ExactCheckpointCallback(BaseCallback):
         raise SystemExit(128 + number)
 
     def _on_step(self) -> bool:
-        return self._caught is None
+        # After the last step there is nothing to stop: what is left of the round belongs to the training
+        return self._caught is None or self.model.num_timesteps >= self.model._total_timesteps
 
     def _release_signals(self) -> None:
         for number, handler in self._handlers.items():

@@ -22,6 +22,9 @@ from sb3_gac.checks.requirements import warn_of_other_rewards
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.source import ReplaySource
 
+#: Number of steps at the start of training whose rewards are compared with those of ``compute_reward``: rare ones may agree
+COMPARED = 20
+
 
 class DataCollection(OffPolicyAlgorithm):
     """
@@ -40,6 +43,8 @@ class DataCollection(OffPolicyAlgorithm):
     _resumed_noise: Any = None
     _returns_so_far: Any
     _behaviour_state: Any
+    #: Number of steps whose rewards are still to be compared with those of ``compute_reward``
+    _rewards_to_compare: int = 0
     _fit_action_noise: Callable[[], None]
     _make_behaviour: Callable[[int], Behaviour]
     chooses_behaviour: Behaviour
@@ -85,6 +90,7 @@ class DataCollection(OffPolicyAlgorithm):
             self.replay_buffer = self._make_replay_buffer()
         if self.replay_buffer is not None:
             check_number(self.replay_buffer, self.n_envs)
+        self._rewards_to_compare = COMPARED if isinstance(self.replay_buffer, HerReplayBuffer) else 0
         if reset_num_timesteps:
             self._rollout_steps, self._rollout_episodes = 0, 0
         noise, self._resumed_noise = deepcopy(self._resumed_noise), None
@@ -123,6 +129,8 @@ class DataCollection(OffPolicyAlgorithm):
         self.follow_arguments()
         if not isinstance(train_freq, TrainFreq):  # somebody has set a number
             train_freq = self.train_freq
+        if action_noise is not None:  # which may have been set since SB3 looked
+            action_noise = self.action_noise
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
         continue_training = True
@@ -188,12 +196,17 @@ class DataCollection(OffPolicyAlgorithm):
                 values[index] = final[key]
         rewards = source.reward(reward)
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, rewards, dones, infos)  # type: ignore[arg-type]
-        if self.num_timesteps == self._num_timesteps_at_start:  # one look is enough
+        if self._rewards_to_compare > 0:
             assert self.env is not None
-            warn_of_other_rewards(type(replay_buffer), self.replay_buffer_kwargs, self.env, next_obs, rewards, infos)
+            said = warn_of_other_rewards(self.replay_buffer_kwargs, self.env, next_obs, rewards, infos)
+            self._rewards_to_compare = 0 if said else self._rewards_to_compare - 1
         self._returns_so_far += rewards
         self._last_obs, self._last_original_obs, self._last_episode_starts = new_obs, following, np.array(dones)
 
     def _excluded_save_params(self) -> list[str]:
-        of_the_data = ["_rollout_steps", "_rollout_episodes"]  # of the rollout under way, which a model's file does not hold
+        of_the_data = [
+            "_rollout_steps",
+            "_rollout_episodes",
+            "_rewards_to_compare",
+        ]  # of the rollout under way, which a model's file does not hold
         return [*super()._excluded_save_params(), "_resumed_noise", *of_the_data]

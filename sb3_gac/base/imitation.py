@@ -12,7 +12,7 @@ Behaviour cloning (Pomerleau 1991) and DAgger (Ross et al. 2011, arXiv 1011.0686
     model.learn(100_000)
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -222,8 +222,14 @@ def _network(model: BaseAlgorithm, name: str) -> nn.Module:
 def _made_of(network: Any) -> dict[str, Any]:
     """Name -> shape of each parameter, and name -> value of whatever else tells what the network computes with them."""
     settings = {name: getattr(network, name) for name in _SETTINGS if hasattr(network, name)}
-    entries = dict(network.observation_space.spaces)
-    return {name: tuple(value.shape) for name, value in network.state_dict().items()} | settings | {"entries": entries}
+    settings = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+    # The bounds of a Box change nothing, and differ between noises
+    entries = {f"entry {key}": space.shape if isinstance(space, spaces.Box) else space for key, space in _entries_of(network)}
+    return {name: tuple(value.shape) for name, value in network.state_dict().items()} | settings | entries
+
+
+def _entries_of(network: Any) -> Iterable[tuple[str, spaces.Space]]:
+    return network.observation_space.spaces.items()
 
 
 def _as_tensors(policy: AsymmetricPolicy, demonstrations: Demonstrations) -> tuple[dict[str, th.Tensor], th.Tensor]:

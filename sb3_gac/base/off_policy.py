@@ -13,7 +13,7 @@ from typing_extensions import Self, Unpack
 
 from sb3_gac.base.algorithm import AsymmetricAlgorithm
 from sb3_gac.base.arguments import OffPolicyArguments, with_defaults
-from sb3_gac.base.augmentation import shifted, shifted_entries
+from sb3_gac.base.augmentation import check_channels_first, shifted, shifted_entries
 from sb3_gac.base.batch import Batch, Metrics
 from sb3_gac.base.behaviour import BehaviourSpec
 from sb3_gac.base.collecting import DataCollection
@@ -25,7 +25,7 @@ from sb3_gac.base.replay_data import ReplayData
 from sb3_gac.base.roles import RoleKeys, resolve_role_keys, resolve_update_every
 from sb3_gac.checks.arguments import COMMON_CHECKS, OFF_POLICY_CHECKS, ArgumentCheck, check_train_freq
 from sb3_gac.checks.entries import check_held_by
-from sb3_gac.checks.requirements import check_action_noise, check_goals, check_rewards_of_goals
+from sb3_gac.checks.requirements import check_action_noise, check_goals, check_hindsight, check_rewards_of_goals
 from sb3_gac.networks.heads import resolve_target_entropy
 from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
@@ -178,12 +178,11 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         assert isinstance(self.observation_space, spaces.Dict)
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
         self._check_replay_buffer_kwargs()
+        check_goals(self.replay_buffer_class, self.observation_space, self.env)
         roles = self.policy_class.roles
-        seen = resolve_role_keys(self.observation_space, roles, self.role_keys)
-        others = {role: keys for role, keys in seen.items() if role != roles.deployed}  # which a warning is given for
-        check_goals(self.replay_buffer_class, self.observation_space, self.env, others)
         resolve_update_every(roles, self.policy_delay, self.update_every)
-        self._shifted_entries = shifted_entries(self.observation_space, seen[roles.deployed], self.random_shift)
+        seen = resolve_role_keys(self.observation_space, roles, self.role_keys)[roles.deployed]
+        self._shifted_entries = shifted_entries(self.observation_space, seen, self.random_shift)
         if self.recording is not None and not issubclass(self._present_buffer_class, CompactDictReplayBuffer):
             raise ValueError("recording needs a CompactDictReplayBuffer: leave replay_buffer_class out.")
         self._make_behaviour()
@@ -235,12 +234,24 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
     # --- learning ---------------------------------------------------------------------------------------------------
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        self.chooses_behaviour.check_parts()
+        self._check_before_training()
         self._recorded = None if self.recording is None else Recording(self.recording, self.n_envs)
         result = super()._setup_learn(*args, **kwargs)
         assert self.env is not None
         check_rewards_of_goals(self.replay_buffer_class, self.replay_buffer_kwargs, self.env)
         return result
+
+    def _check_before_training(self) -> None:
+        """Check what matters to training alone, so that a model that only acts, and is saved, needs none of it."""
+        assert isinstance(self.observation_space, spaces.Dict)
+        self.chooses_behaviour.check_parts()
+        check_channels_first(self.observation_space, self._shifted_entries, self.random_shift)
+        roles = self.policy_class.roles
+        seen = resolve_role_keys(self.observation_space, roles, self.role_keys)
+        follow = set(roles.unprivileged) - set(self.role_keys or ())  # these read what the deployed policy reads
+        critics = {roles.deployed if role in follow else role: seen[role] for role in roles.critics}
+        assert self.env is not None
+        check_hindsight(self.replay_buffer_class, critics, roles.deployed, self.env)
 
     def learn(
         self,

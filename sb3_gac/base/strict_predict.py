@@ -51,7 +51,7 @@ class DeploymentGuard(BaseAlgorithm):
         elif self._n_updates and (found := inputs_apart(self.normalised_scales, scales_of(self.env), now)):
             warnings.warn(
                 f'The model has learned from an entry "{found[0]}" that VecNormalize normalised by other statistics: what its '
-                f"networks see is {found[1]:.1f} standard deviations off. Wrap the environments in VecNormalize.load(<the "
+                f"networks see is {found[1]:.2f} standard deviations off. Wrap the environments in VecNormalize.load(<the "
                 "statistics that were saved with the model>, env), or train a new model.",
                 stacklevel=3,
             )

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
@@ -81,18 +80,14 @@ def warn_of_an_unseen_goal(role: str, seen: Collection[str], space: spaces.Space
         )
 
 
-def check_goals(
-    buffer_class: Any, space: spaces.Dict, env: VecEnv | None, seen: Mapping[str, Collection[str]] = MappingProxyType({})
-) -> None:
+def check_goals(buffer_class: Any, space: spaces.Dict, env: VecEnv | None) -> None:
     """
-    Check that an environment has the goals that ``HerReplayBuffer`` needs, and that networks know the goal.
+    Check that an environment has the goals that ``HerReplayBuffer`` needs.
 
     :param buffer_class: value of the argument ``replay_buffer_class``; only ``HerReplayBuffer`` is checked
     :param space: observation space of the environment
     :param env: environments whose ``compute_reward`` rewards other goals; ``None`` if there are none yet
-    :param seen: role of a network -> entries that it reads
-    :raises ValueError: if goals are missing or of different shapes; if there is no ``compute_reward``, or its goals have
-        another form; if observations have what belongs to the former goals; or if a network does not read the goal
+    :raises ValueError: if goals are missing or of different shapes, or if there is no ``compute_reward``
     """
     if not _is_hindsight(buffer_class):
         return
@@ -110,25 +105,34 @@ def check_goals(
             f'replay_buffer_class={name} puts the entry "achieved_goal" in the place of "desired_goal", but they are '
             f"{achieved} and {desired}: give them one shape."
         )
-    for role, keys in seen.items():
-        if DESIRED_GOAL not in keys:
-            raise ValueError(
-                f"replay_buffer_class={name} rewards a step for other goals too, and the {role}, which reads {list(keys)}, "
-                f'would not know for which: role_keys={{"{role}": {[*keys, DESIRED_GOAL]}}}.'
-            )
-    if env is not None:
-        _check_environments_goals(name, achieved, env)
-
-
-def _check_environments_goals(name: str, goal: spaces.Space, env: VecEnv) -> None:
-    """
-    :param name: name of the replay buffer's class
-    :param goal: space of goals in the observations that are stored
-    :param env: environments
-    """
-    if not env.has_attr("compute_reward"):
+    if env is not None and not env.has_attr("compute_reward"):
         raise ValueError(f"The environment has no method compute_reward. {REWARDS_OF_GOALS}")
+
+
+def check_hindsight(buffer_class: Any, critics: Mapping[str, Collection[str]], deployed: str, env: VecEnv) -> None:
+    """
+    Check, before training, that what ``HerReplayBuffer`` relabels is all that depends on the goal, and that critics know it.
+
+    :param buffer_class: value of the argument ``replay_buffer_class``; only ``HerReplayBuffer`` is checked
+    :param critics: role whose ``role_keys`` decide what some critics read -> entries that they read
+    :param deployed: role of the deployed policy
+    :param env: environments
+    :raises ValueError: if critics do not read the goal; or if a wrapper has changed the goals, or has put into observations
+        what belongs to the former goals
+    """
+    if not _is_hindsight(buffer_class):
+        return
+    name, space = buffer_class.__name__, env.observation_space
+    assert isinstance(space, spaces.Dict)
+    for role, keys in critics.items():
+        if DESIRED_GOAL not in keys:
+            of_whom = "the critics, which read what it reads," if role == deployed else "the critics"
+            raise ValueError(
+                f"replay_buffer_class={name} rewards a step for other goals too, and {of_whom} would not know for which: "
+                f'role_keys={{"{role}": {[*keys, DESIRED_GOAL]}}}.'
+            )
     (inside,) = env.get_attr("observation_space", indices=[0])
+    goal = space[DESIRED_GOAL]
     if isinstance(inside, spaces.Dict) and {*GOALS} <= {*inside.spaces} and inside[DESIRED_GOAL].shape != goal.shape:
         raise ValueError(
             f"replay_buffer_class={name} asks compute_reward about goals of the shape {goal.shape}, but the environment's are "
@@ -167,36 +171,36 @@ def check_rewards_of_goals(buffer_class: Any, buffer_kwargs: Mapping[str, Any], 
 
 
 def warn_of_other_rewards(
-    buffer_class: Any,
     buffer_kwargs: Mapping[str, Any],
     env: VecEnv,
     reached: Mapping[str, np.ndarray],
     rewards: np.ndarray,
     infos: Sequence[Mapping[str, Any]],
-) -> None:
+) -> bool:
     """
-    Warn if the environments reward a step otherwise than ``compute_reward`` does, which will reward it for other goals.
+    Warn if the environments reward a step otherwise than ``compute_reward`` does, by which ``HerReplayBuffer`` rewards it for
+    other goals.
 
-    :param buffer_class: value of the argument ``replay_buffer_class``; only ``HerReplayBuffer`` is looked at
     :param buffer_kwargs: value of the argument ``replay_buffer_kwargs``
     :param env: environments
     :param reached: observations at the step's end, of each environment
     :param rewards: rewards of the step that will be stored, shape (n_envs,)
     :param infos: infos of the step
+    :return: whether there was a difference
     """
-    if not _is_hindsight(buffer_class):
-        return
     known = list(infos) if buffer_kwargs.get("copy_info_dict", False) else [{} for _ in infos]  # as the buffer keeps them
     (computed,) = env.env_method("compute_reward", *(reached[goal] for goal in GOALS), known, indices=[0])
     computed = np.ravel(computed)
-    if not np.allclose(computed, rewards, rtol=1e-3, atol=1e-5):
-        index = int(np.abs(computed - rewards).argmax())
-        warnings.warn(
-            f"The environment rewarded a step by {rewards[index]:g}, and compute_reward gives {computed[index]:g} for it. So "
-            f"{buffer_class.__name__} mixes two kinds of rewards: change compute_reward as wrappers change rewards, or leave "
-            "the wrappers out.",
-            stacklevel=3,
-        )
+    if np.allclose(computed, rewards, rtol=1e-3, atol=1e-5):
+        return False
+    index = int(np.abs(computed - rewards).argmax())
+    warnings.warn(
+        f"The environment rewarded a step by {rewards[index]:g}, and compute_reward gives {computed[index]:g} for it. So "
+        "HerReplayBuffer mixes two kinds of rewards: change compute_reward as wrappers change rewards, or leave the wrappers "
+        "out.",
+        stacklevel=3,
+    )
+    return True
 
 
 def _is_hindsight(buffer_class: Any) -> bool:

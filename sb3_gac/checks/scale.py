@@ -10,6 +10,8 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 Scales: TypeAlias = Mapping[str, tuple[np.ndarray, np.ndarray]]
 #: Root mean square of the differences between a policy's inputs, in standard deviations, from which on they are others
 FAR = 0.5
+#: Standard deviation that a number has which never changes: what is left of the one that statistics begin with
+CONSTANT = 1e-3
 
 
 def entries_normalised_by(env: VecEnv | None) -> tuple[str, ...]:
@@ -76,8 +78,10 @@ def inputs_apart(then: Scales, now: Scales, entries: Iterable[str]) -> tuple[str
     for key in entries:
         if key in then and key in now:
             (mean, std), (present_mean, present_std) = then[key], now[key]
-            # An observation of then is mean + std z, where z has the variance 1
-            apart = float(np.sqrt(np.mean(((mean - present_mean) / present_std) ** 2 + (std / present_std - 1) ** 2)))
+            # An observation of then is mean + std z, where z has the variance 1; a number that never changes has no z
+            varies = np.maximum(std, present_std) > CONSTANT
+            off = ((mean - present_mean) / present_std) ** 2 + np.where(varies, (std / present_std - 1) ** 2, 0.0)
+            apart = float(np.sqrt(np.mean(off)))
             if apart > FAR:
                 return key, apart
     return None
@@ -97,7 +101,7 @@ def check_is_of_training(model: Any, now: Scales, entries: Iterable[str], what: 
     if found is not None:
         raise ValueError(
             f'{what} has other statistics of "{found[0]}" than the VecNormalize that the model was trained with: what the '
-            f"policy sees would be {found[1]:.1f} standard deviations off. Give the statistics that were saved with the model."
+            f"policy sees would be {found[1]:.2f} standard deviations off. Give the statistics that were saved with the model."
         )
 
 
@@ -115,7 +119,7 @@ def check_same_statistics(name: str, entries: Iterable[str], then: Scales, env: 
     if found is not None:
         raise ValueError(
             f'{name} was trained on an entry "{found[0]}" that VecNormalize normalised by other statistics than those of env: '
-            f"what {name} sees would be {found[1]:.1f} standard deviations off. Wrap env in VecNormalize.load(<the statistics "
+            f"what {name} sees would be {found[1]:.2f} standard deviations off. Wrap env in VecNormalize.load(<the statistics "
             f"of the {name}'s training>, env), and set its training to False."
         )
 

@@ -136,11 +136,9 @@ class Environment:
     @property
     def _own_arguments(self) -> Mapping[str, Any]:
         """Those arguments of the environment that make a setting -> their values in training."""
-        name = self.env_id.rpartition(":")[2]
+        parameters, name = self._parameters, self.env_id.rpartition(":")[2]  # which imports the module that registers it
         registered = gym.registry[name].kwargs if name in gym.registry else {}
-        defaults = {
-            argument: self._parameters[argument].default for argument in ARGUMENTS.values() if argument in self._parameters
-        }
+        defaults = {argument: parameters[argument].default for argument in ARGUMENTS.values() if argument in parameters}
         given = {
             argument: value for argument, value in {**registered, **self.kwargs}.items() if argument in ARGUMENTS.values()
         }

@@ -51,7 +51,9 @@ def options_of(directory: Path) -> Namespace:
         made = dict(configuration["environment"]).get("kwargs") or {}
         if given.get("privileged") != made.get("privileged"):  # earlier versions wrote "state" whatever the task has
             given.pop("privileged", None)
-        return Namespace(**vars(resolve(given)) | {"resume": directory})
+        # A run of an earlier version has statistics of its own, and not its teacher's
+        as_begun = {"resume": directory, "normalize": configuration.get("normalize", False)}
+        return Namespace(**vars(resolve(given)) | as_begun)
     except (TypeError, ValueError) as error:
         raise ValueError(f"--resume {directory}: {CONFIGURATION}: {error}") from error
 

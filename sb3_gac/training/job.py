@@ -36,7 +36,7 @@ from sb3_gac.training.directory import (
 )
 from sb3_gac.training.environments import entries_of_floats, find_modules_here, make_envs, normalized
 from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, evaluate, untrained_policies
-from sb3_gac.training.options import EPISODES_ON_THE_WAY, algorithm_arguments
+from sb3_gac.training.options import EPISODES_ON_THE_WAY, TEACHER, algorithm_arguments
 from sb3_gac.training.progress import Progress
 
 EVALUATIONS = 10
@@ -133,11 +133,12 @@ def open_environments(options: Namespace) -> tuple[VecEnv, VecEnv]:
         env = make_envs(*made, options.envs, options.seed)
         eval_env = make_envs(*made, min(EPISODES_ON_THE_WAY, options.episodes))
         normalization = PRESETS[options.preset].normalization(options.algorithm)
-        if normalization is None and options.normalize:
+        teacher = options.teacher if options.normalize == TEACHER else None
+        if normalization is None and options.normalize is True:
             normalization = {"norm_obs_keys": entries_of_floats(env)}
         return (
-            normalized(env, normalization, teacher=options.teacher),
-            normalized(eval_env, normalization, training=False, teacher=options.teacher),
+            normalized(env, normalization, teacher=teacher),
+            normalized(eval_env, normalization, training=False, teacher=teacher),
         )
     except (ImportError, GymnasiumError, TypeError, ValueError) as error:
         raise ValueError(f"{options.env_id}: {error}") from error

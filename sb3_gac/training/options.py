@@ -13,6 +13,7 @@ import yaml
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
 from sb3_gac.base.loading import model_file
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.envs.suites import SUITES, Suite, env_id_of, registered_id, suite_of, task_of
 from sb3_gac.presets import PRESETS, instantiate, merge, preset, read_preset
 
@@ -228,6 +229,8 @@ def resolve(given: Mapping[str, Any]) -> Namespace:
         _resolve_task(options, given, SUITES[suite])
     options.envs = options.envs or read_preset(options.preset).envs
     _check_teacher(options)
+    if options.teacher is not None and (options.teacher.parent / STATISTICS).is_file():
+        options.normalize = TEACHER
     _check_overrides(options.overrides)
     _check_runs(options.runs)
     return options

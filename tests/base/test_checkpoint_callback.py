@@ -71,11 +71,14 @@ def test_a_signal_in_the_last_step_ends_the_process_and_not_the_next_training(tm
                 os.kill(os.getpid(), signal.SIGTERM)
             return super().step(action)
 
+    model = small_model(TwoViewBandit()).learn(20)
+    n_updates = model._n_updates
     model = small_model(Signalling())
     callback = ExactCheckpointCallback(tmp_path, every=100)
     with pytest.warns(UserWarning, match="SIGTERM"), pytest.raises(SystemExit, match="143"):
         model.learn(20, callback=callback)
-    assert type(model).resume(tmp_path, Signalling(), device="cpu").num_timesteps == 20
+    resumed = type(model).resume(tmp_path, Signalling(), device="cpu")
+    assert (resumed.num_timesteps, resumed._n_updates) == (20, n_updates), "the last round of gradient steps as well"
     assert model.learn(20, callback=callback, reset_num_timesteps=False).num_timesteps == 40
 
 

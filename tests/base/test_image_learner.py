@@ -132,12 +132,22 @@ def _channels_last():
     return Sampled(spaces.Dict(partial=image, privileged=vector))
 
 
+def test_images_with_their_channels_last_are_not_shifted_over_colours(tmp_path):
+    """A model of such images may act, as one of an earlier version does."""
+    model = small_model(_channels_last(), random_shift=1, policy_kwargs=SMALL)
+    with pytest.raises(ValueError, match=r"random_shift=1 needs .* channels first, and \['partial'\] seem to have them last"):
+        model.learn(20)
+    model.save(tmp_path / "model")
+    GAC.load(tmp_path / "model", device="cpu")
+    many = spaces.Dict(partial=spaces.Box(0, 1, (48, 40, 44), np.float32), privileged=spaces.Box(-1, 1, (2,), np.float32))
+    small_model(Sampled(many), random_shift=1, policy_kwargs=SMALL).learn(3)
+
+
 @pytest.mark.parametrize(
     ("env", "pixels", "said"),
     [
         (TwoViewBandit, 4, r"random_shift=4 shifts images, but the deployed policy reads \['partial'\], of which none is"),
         (_env, 36, r'random_shift=36 leaves nothing of the entry "partial"'),
-        (_channels_last, 1, r"random_shift=1 needs images with their channels first, and \['partial'\] have them last"),
         (_env, -1, "random_shift must be an integer >= 0"),
         (_env, 0.5, "random_shift must be an integer >= 0"),
     ],

@@ -207,6 +207,20 @@ def test_an_independent_guider_starts_as_the_teacher(env):
     np.testing.assert_array_equal(still, taught, err_msg="the teacher is not trained along")
 
 
+def test_networks_of_another_noise_and_of_equal_settings_are_copied():
+    """Sensor noise widens the bounds of a Box, which changes nothing."""
+    clean, noisy = (make_vec("sb3_gac/Pendulum-v1", 1, 0, noise_std=noise) for noise in (0.0, 0.1))
+    assert clean.observation_space != noisy.observation_space
+    bounds = {"policy_kwargs": {"net_arch": [16], "log_std_bounds": [-5.0, 2.0]}}
+    source = GAC("MultiInputPolicy", clean, **SMALL | bounds)
+    bounds["policy_kwargs"]["log_std_bounds"] = (-5.0, 2.0)
+    model = GAC("MultiInputPolicy", noisy, **SMALL | bounds | {"seed": 1})
+    copy_networks(model, source, {"learner": "learner"})
+    observation = {"partial": np.full(2, 0.3, np.float32)}
+    copied, expected = (one.predict(observation, deterministic=True)[0] for one in (model, source))
+    np.testing.assert_array_equal(copied, expected)
+
+
 def test_networks_that_do_not_fit_are_refused_and_nothing_is_copied(env):
     teacher = AsymmetricSAC("MultiInputPolicy", env, **SMALL | {"policy_kwargs": {"net_arch": [8]}})
     model = GAC("MultiInputPolicy", env, **SMALL)

@@ -120,8 +120,9 @@ def test_noise_made_for_several_environments_is_made_for_as_many_as_there_are():
     assert model.action_noise.n_envs == 2
 
 
-def test_noise_that_is_set_in_the_middle_is_made_for_as_many_as_there_are():
-    model = small_model(_envs(2), learning_starts=0)
+@pytest.mark.parametrize("gradient_steps", [1, 0])
+def test_noise_that_is_set_in_the_middle_is_made_for_as_many_as_there_are(gradient_steps):
+    model = small_model(_envs(2), learning_starts=0, gradient_steps=gradient_steps)
     said = []
 
     def set_noise(found, _):

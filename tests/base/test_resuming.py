@@ -147,6 +147,7 @@ OF_RESUMING = {
     "frozen",
     "_saved_scales",  # normalised_scales is compared
     "_normaliser",
+    "_rewards_to_compare",
 }
 
 

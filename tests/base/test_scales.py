@@ -105,10 +105,20 @@ def test_demonstrations_need_the_teachers_statistics(trained):
 def test_training_that_goes_on_under_other_statistics_is_warned_of(trained):
     _, file, statistics = trained
     with pytest.warns(
-        UserWarning, match=r'learned from an entry "partial" that VecNormalize .* \d\.\d standard deviations off'
+        UserWarning, match=r'learned from an entry "partial" that VecNormalize .* \d\.\d\d standard deviations off'
     ):
         AsymmetricSAC.load(file, env=_normalised(centre=0.0), device="cpu").learn(4)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="The model has learned from an entry")
         AsymmetricSAC.load(file, env=VecNormalize.load(str(statistics), _raw()), device="cpu").learn(4)
         small_model(_normalised(), GAC).learn(40).learn(40)
+
+
+def test_a_number_that_never_changes_has_no_scale():
+    """Of what its statistics began with there is less the longer they are gathered; 2.4e-4 and 1.2e-4 after so many steps."""
+    then, now = ({"a": (np.zeros(2), np.array([1.0, std]))} for std in (2.4e-4, 1.2e-4))
+    assert inputs_apart(then, now, ["a"]) is None
+    moved = {"a": (np.array([0.0, 0.01]), np.array([1.0, 1.2e-4]))}
+    assert inputs_apart(then, moved, ["a"]) is not None, "another constant is another input"
+    alive = {"a": (np.zeros(2), np.array([1.0, 0.1]))}
+    assert inputs_apart(then, alive, ["a"]) is not None, "one that moves is none"

@@ -126,6 +126,15 @@ def test_what_an_environment_is_registered_with_is_what_it_was_trained_with():
     assert Environment("tests/Disturbed-v0", {"delay": 2}).trained == Setting(0.5, 2)
 
 
+def test_a_module_is_imported_before_its_registration_is_read(tmp_path, monkeypatch):
+    source = (
+        "from tests.evaluation.test_settings import Taking, gym\ngym.register('Late-v0', Taking, kwargs={'noise_std': 0.3})\n"
+    )
+    (tmp_path / "registers_late.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert Environment("registers_late:Late-v0").trained == Setting(0.3)
+
+
 def test_disturbances_that_stay_are_named():
     """A task in wrappers of one's own has them beside those of a setting."""
     wrappers = [{"sb3_gac.envs:SensorNoise": {"noise_std": 0.5}}, {"sb3_gac.envs:SensorDelay": {"steps": 2}}]

@@ -248,21 +248,39 @@ def test_rewards_are_stored_and_looked_at_as_they_were_before_they_are_normalise
 
 
 def test_goals_in_another_form_than_the_environments_are_refused():
+    model = GAC("MultiInputPolicy", VecFrameStack(DummyVecEnv([_reach]), 3), **REACH)
     with pytest.raises(ValueError, match=r"compute_reward about goals of the shape \(9,\), but .* shape \(3,\): a wrapper"):
-        GAC("MultiInputPolicy", VecFrameStack(DummyVecEnv([_reach]), 3), **REACH)
+        model.learn(3)
 
 
 def test_rewards_for_the_former_goals_are_not_left_in_observations():
-    with pytest.raises(ValueError, match=r"PreviousAction\(reward=True\) keeps rewards for the former goals"):
-        GAC("MultiInputPolicy", PreviousAction(_reach(), reward=True), **REACH)
-    GAC("MultiInputPolicy", PreviousAction(_reach()), **REACH)
+    """Nor in environments that the model gets later."""
+    model = GAC("MultiInputPolicy", PreviousAction(_reach(), reward=True), **REACH)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"PreviousAction\(reward=True\) keeps rewards for the former goals"):
+            model.learn(3)
+        model.set_env(PreviousAction(_reach(), reward=True))
+    GAC("MultiInputPolicy", PreviousAction(_reach()), **REACH).learn(3)
 
 
 @with_goals
-def test_networks_that_do_not_know_the_goal_are_refused(algorithm):
-    role, critic = deployed_role(algorithm), next(name for name in make(algorithm, TwoViewBandit()).policy.roles.critics)
-    keys = {role: LEARNER, critic: ["observation"]}
-    said = rf"the {critic}, which reads \['observation'\], would not know .* role_keys={{\"{critic}\": \['observation', 'des"
-    with pytest.raises(ValueError, match=said):
-        make(algorithm, _env(), role_keys=keys, replay_buffer_class=HerReplayBuffer)
-    make(algorithm, _env(), role_keys=keys)  # without hindsight, another entry may hold the goal
+def test_critics_that_do_not_know_the_goal_are_refused_where_training_begins(algorithm, tmp_path):
+    critic = next(iter(make(algorithm, TwoViewBandit()).policy.roles.critics))
+    her = {"replay_buffer_class": HerReplayBuffer, "learning_starts": 1000}
+    model = make(algorithm, _env(), role_keys={deployed_role(algorithm): LEARNER, critic: ["observation"]}, **her)
+    with pytest.raises(
+        ValueError, match=rf"the critics would not know .* role_keys={{\"{critic}\": \['observation', 'desired_g"
+    ):
+        model.learn(3)
+    model.save(tmp_path / "model")
+    load(algorithm, tmp_path / "model")  # a model of an earlier version acts
+
+
+def test_critics_that_read_what_the_policy_reads_learn_of_the_goal_by_it():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the policy would not know the goal either
+        model = make("cosil", _env(), role_keys={"actor": ["observation"]}, replay_buffer_class=HerReplayBuffer)
+    with pytest.raises(
+        ValueError, match=r"critics, which read what it reads, would .* role_keys={\"actor\": \['observation', 'd"
+    ):
+        model.learn(3)
