@@ -172,7 +172,7 @@ def test_the_statistics_of_vec_normalize_count(tmp_path):
         "other.pkl": "holds dict, not what VecNormalize.save writes",
         "rewards.pkl": r"rewards\.pkl has no statistics of \['partial', 'privileged'\], which were normalised in training",
         "privileged.pkl": r"privileged\.pkl has no statistics of \['partial'\], which were",
-        "far.pkl": r'far\.pkl has other statistics of "partial" .* would be 3\.0 standard deviations off',
+        "far.pkl": r'far\.pkl has other statistics of "partial" .* would be 3\.00 standard deviations off',
         "foreign.pkl": r"is of another environment: its \"partial\" has the shape \(5,\), and the model's \(2,\)",
     }.items():
         with pytest.raises(SystemExit, match=message):
