@@ -15,11 +15,12 @@ import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from benchmarks import aggregate, launch
+from benchmarks.advice import counted, findings, recommendation
 from benchmarks.checkpoint import write_atomically
 from benchmarks.comparison_page import page
 from benchmarks.config import check_programs, check_runs, check_simulators, first_gradient_step, reads_partial_alone
 from benchmarks.environments import EVAL_SEED, environment, make_envs
-from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, counted, findings, recommendation, worth
+from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, worth
 from benchmarks.run import check_unfinished
 from benchmarks.suite import NAME, RunSpec, cells_of, default_name, read_definitions, read_suite
 from benchmarks.tidy import file_of, read_tidy

@@ -9,15 +9,8 @@ import numpy as np
 import pandas as pd
 from plotly import graph_objects
 
-from benchmarks.headroom import (
-    Worth,
-    counted,
-    findings,
-    headroom_curve,
-    in_words,
-    recommendation,
-    title,
-)
+from benchmarks.advice import counted, findings, in_words, recommendation, title
+from benchmarks.headroom import Worth, headroom_curve
 from benchmarks.intervals import CONFIDENCE, Difference, mean_interval
 from benchmarks.page.cells import palette, title_of
 from benchmarks.page.document import document, tabs

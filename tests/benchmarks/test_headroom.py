@@ -7,19 +7,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from benchmarks.headroom import (
-    ends_table,
-    findings,
-    headroom_curve,
-    in_words,
-    main,
-    number,
-    power,
-    read_together,
-    recommendation,
-    seeds_to_see,
-    worth,
-)
+from benchmarks.advice import findings, in_words, recommendation
+from benchmarks.headroom import ends_table, headroom_curve, main, number, power, read_together, seeds_to_see, worth
 from benchmarks.tidy import NO_NOISE
 
 RANDOM = {"random actions": np.array([-2.0, 0.0, 2.0, 0.0])}
