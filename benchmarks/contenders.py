@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
+import numpy as np
 import torch as th
 
 Timer = Callable[[int], float]
@@ -103,3 +104,12 @@ def alternate(timers: dict[str, Timer], repetitions: int, rounds: int) -> dict[s
         for name, one in timers.items():
             seconds[name].append(one(repetitions))
     return {name: values[1:] for name, values in seconds.items()}
+
+
+def median_ratio(numerators: list[float], denominators: list[float]) -> float:
+    """
+    :param numerators: seconds of one contender, one number for each block
+    :param denominators: seconds of another contender in the same blocks
+    :return: median over the blocks of the ratio of the two
+    """
+    return float(np.median(np.array(numerators) / np.array(denominators)))

@@ -15,15 +15,9 @@ import torch as th
 from benchmarks import speed
 from benchmarks.contenders import alternate, process_timers, timer
 from benchmarks.models import BASELINES, LoopedGRU, make_baseline_step, recurrent_step_flops, step_flops
+from benchmarks.part_speed import compare_buffers, compare_checkpoints, compare_deployment
 from benchmarks.profiles import cumulative_seconds, env_step, profile_rollout, profile_step
-from benchmarks.speed import (
-    compare_baselines,
-    compare_buffers,
-    compare_checkpoints,
-    compare_deployment,
-    compare_recurrent,
-    compare_steps,
-)
+from benchmarks.step_speed import compare_baselines, compare_recurrent, compare_steps
 from sb3_gac.checkpoint.rows import BLOCK_BYTES
 
 
