@@ -15,6 +15,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_gac.envs.attributes import arguments_of, attributes_of, restore_attributes
+
 #: Class -> names of the attributes that a reset or a step changes
 CHANGING: dict[str, tuple[str, ...]] = {
     "gymnasium.wrappers.common.TimeLimit": ("_elapsed_steps",),
@@ -54,9 +56,10 @@ _CHECKED = ("checked_reset", "checked_step", "checked_data_reuse")
 _MUJOCO = "mujoco"  # key of the state of MuJoCo's model and data in a layer's state
 MADE_WITH = "_settings_made_with"  # attribute of layers with settings, see settings_of
 _SETTINGS = "settings"  # key of the settings in a layer's state
-#: Attributes that a reset draws, and prefixes of the arrays in MuJoCo's model that a reset may change, beside its options
-_DRAWN = ("goal",)
+#: Packages whose environments change no attribute that a checkpoint can't hold, or have it restored by a wrapper
+_KNOWN = ("gymnasium", "gymnasium_robotics", "humanoid_bench", "sb3_gac")
 _ADDRESSES = ("plugin_data",)  # memory addresses of plugins' data, which another process can't use
+#: Prefixes of the arrays in MuJoCo's model that a reset may change, beside its options
 LOOKS = ("cam_", "geom_", "light_", "mat_", "site_", "tendon_")
 _PARTS = (*LOOKS, "actuator_", "body_", "dof_", "eq_", "hfield_data", "jnt_", "pair_", "qpos")
 
@@ -204,15 +207,27 @@ def _mujoco_state(layer: Any) -> dict[str, Any]:
         "derived": {name: array.copy() for name, array in arrays_of(layer.data).items()},
         "model": {name: array.copy() for name, array in arrays_of(layer.model, _PARTS).items()},
         "options": _options(layer.model.opt),
-        "drawn": {name: deepcopy(getattr(layer, name)) for name in _DRAWN if hasattr(layer, name)},
+        "attributes": _attributes(layer),
+        "arguments": arguments_of(layer),
     }
+
+
+def _attributes(layer: gym.Env) -> dict[str, Any]:
+    attributes, unknown = attributes_of(layer)
+    if unknown and type(layer).__module__.partition(".")[0] not in _KNOWN:
+        raise NotRestorableError(
+            f"the attribute {unknown[0]} of {_name(layer)} is a {type(getattr(layer, unknown[0])).__qualname__}, which a "
+            "checkpoint can't hold: use numbers, strings, lists, dicts, arrays and generators of its own, or make it an "
+            "attribute of the class if it never changes"
+        )
+    return attributes
 
 
 def _restore_mujoco(layer: Any, saved: dict[str, Any]) -> None:
     import mujoco
 
-    for name, value in saved.get("drawn", {}).items():  # files of earlier versions have no such entry
-        setattr(layer, name, value)
+    attributes = saved.get("attributes", saved.get("drawn", {}))  # files of earlier versions have fewer, or none
+    restore_attributes(layer, attributes, saved.get("arguments"))
     _write(arrays_of(layer.model, _PARTS), saved.get("model", {}))
     for name, value in saved.get("options", {}).items():
         setattr(layer.model.opt, name, value)

@@ -1,14 +1,19 @@
 """The state of an environment in the middle of an episode, taken down and put back."""
 
+import json
+from collections import deque
 from copy import deepcopy
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from gymnasium import spaces
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_gac.checkpoint.serialization import decode, encode
 from sb3_gac.envs import DroppedFrames, History, PreviousAction, SensorDelay, SensorNoise, SplitObservation
 from sb3_gac.envs.state import NotRestorableError, env_state, restore_env_state
 from tests.helpers import TwoViewBandit
@@ -216,6 +221,115 @@ def test_what_a_reset_draws_of_the_model_is_restored(change):
         np.testing.assert_array_equal(getattr(other.model, name), getattr(env.model, name))
     actions = np.random.default_rng(0).uniform(-1, 1, (20, 3))
     np.testing.assert_equal(_go_on(other, actions), _go_on(env, actions))
+
+
+class Following(HopperEnv):
+    """A hopper with a state of its own in Python: a commanded speed that follows a slow walk, and past actions."""
+
+    def __init__(self, weight=1.0, level=0, **kwargs):
+        self.weight, self._level, self.tool = weight, level, None
+        super().__init__(**kwargs)
+
+    def reset_model(self):
+        self.n, self.recent = 0, deque([np.zeros(3)] * 2, maxlen=2)
+        self.command = {
+            "speed": self.np_random.uniform(0, 2),
+            "walk": np.random.default_rng(int(1e6 * self.np_random.uniform())),
+        }
+        self.joints = self.data.qpos[3:]
+        return super().reset_model()
+
+    def step(self, action):
+        observation, _, _, _, info = super().step(action)
+        self.n += 1
+        self.recent.append(np.array(action))
+        self.command["speed"] += self.command["walk"].normal()
+        jerk = np.square(self.recent[0] - self.recent[1]).sum()
+        reward = -self.weight * abs(info["x_velocity"] - self.command["speed"]) - jerk - abs(self.joints).sum()
+        return observation, float(reward), False, self.n >= 20, info
+
+
+def _through_a_file(state):
+    arrays = {}
+    return decode(json.loads(json.dumps(encode(state, arrays))), arrays)
+
+
+def test_attributes_of_an_own_mujoco_environment_are_restored():
+    env, other = Following(), Following()
+    actions = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    env.reset(seed=1)
+    _go_on(env, actions[:27])
+    env._level = 3
+    other.reset(seed=7)
+    restore_env_state(other, _through_a_file(env_state(env)))
+    assert (other.n, other._level, other.recent.maxlen) == (7, 3, 2)
+    np.testing.assert_equal(_go_on(other, actions), _go_on(env, actions))
+
+
+def test_an_own_mujoco_environment_that_was_never_reset_takes_attributes():
+    env, other = Following(), Following()
+    env.reset(seed=1)
+    env.step(np.ones(3))
+    restore_env_state(other, env_state(env))
+    assert (other.n, other.command["speed"]) == (1, env.command["speed"])
+
+
+@pytest.mark.parametrize(
+    ("tool", "kind"),
+    [
+        (spaces.Box(-1, 1), None),
+        ([len, int], None),
+        ({1: 2.0}, "dict"),
+        (object(), "object"),
+        (np.array([None]), "ndarray"),
+        (TwoViewBandit(), "TwoViewBandit"),
+        (gym.wrappers.TimeLimit(TwoViewBandit(), 7), "TimeLimit"),
+        (mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")), "MjData"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_an_attribute_that_cannot_be_held_is_named(tool, kind):
+    env = Following()
+    env.tool = tool
+    if kind is None:
+        assert "tool" not in env_state(env)[0]["mujoco"]["attributes"]
+        return
+    with pytest.raises(NotRestorableError, match=rf"the attribute tool of .*Following is a {kind}, which a checkpoint can't"):
+        env_state(env)
+
+
+def test_two_names_for_one_generator_are_not_taken_for_two_generators():
+    env = Following()
+    env.reset(seed=0)
+    env.tool = env.np_random
+    with pytest.raises(NotRestorableError, match=r"the attribute tool of .*generators of its own"):
+        env_state(env)
+
+
+def test_an_environment_made_with_another_argument_keeps_it():
+    def make(**kwargs):
+        env = gym.make(EnvSpec("Following-v0", entry_point=Following, kwargs={"weight": 1.0}), **kwargs)
+        env.reset(seed=0)
+        return env
+
+    env = make(weight=2.0, level=1)
+    env.unwrapped.weight, env.unwrapped._level = 2.5, 4
+    alike, other = make(weight=2.0, level=1), make(level=2)
+    for one in (alike, other):
+        restore_env_state(one, env_state(env))
+    assert (alike.unwrapped.weight, alike.unwrapped._level) == (2.5, 4)
+    assert (other.unwrapped.weight, other.unwrapped._level) == (1.0, 2)
+    assert other.unwrapped.command["speed"] == env.unwrapped.command["speed"]
+
+
+def test_a_state_of_an_earlier_version_has_drawn_goals():
+    env = Following()
+    env.reset(seed=0)
+    state = env_state(env)
+    del state[0]["mujoco"]["attributes"], state[0]["mujoco"]["arguments"]
+    state[0]["mujoco"]["drawn"] = {"goal": np.ones(3)}
+    restore_env_state(env, state)
+    np.testing.assert_array_equal(env.goal, np.ones(3))
 
 
 class _Unknown(gym.Wrapper):
