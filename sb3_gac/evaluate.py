@@ -197,7 +197,7 @@ class Evaluation:
         reads = (f"The {name} reads {' and '.join(policy.entries)}." for name, policy in self.policies.items())
         print(f"{self.title}. {' '.join(reads)}")
         if beside := self.environment.beside:
-            print(f"Settings come on top of what {self.environment.env_id} has of its own: {' and '.join(beside)}.")
+            print(f"{self.environment.env_id}: settings come on top of {beside}.")
         undisturbed: dict[str, list[Episode]] = {}
         for setting in self.settings:
             self.outcomes[setting] = {}

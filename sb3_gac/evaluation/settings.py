@@ -3,7 +3,6 @@
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,9 +14,9 @@ from sb3_gac.algorithms import import_path
 from sb3_gac.envs.disturbances import DroppedFrames, SensorDelay, disturb
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
-from sb3_gac.envs.suites import SUITES, batch_factory, env_id_of, is_batched, suite_of
+from sb3_gac.envs.suites import SUITES, batch_factory, env_id_of, is_batched, suite_of, without_module
 from sb3_gac.envs.wrappers import SensorNoise
-from sb3_gac.training.environments import in_wrappers
+from sb3_gac.training.environments import creator_of, in_wrappers
 
 CONFIGURATION = "config.yaml"
 #: Part of the setting -> values that are evaluated if none are asked for
@@ -85,7 +84,7 @@ class Environment:
 
     def make(self, setting: Setting, render_mode: str | None = None) -> gym.Env:
         """
-        Make the environment in a setting, by its own arguments where it has them, and by wrappers where it has not.
+        Make the environment in a setting: one of this package by its own arguments where it has them, else by wrappers.
 
         :param setting: setting of the sensor
         :param render_mode: gymnasium's render mode, ``None`` for none
@@ -118,15 +117,17 @@ class Environment:
         return Setting(**known)
 
     @property
-    def beside(self) -> list[str]:
+    def beside(self) -> str:
         """
-        What disturbs the sensor beside the setting: arguments that the environment does not have, so that it may have a
-        disturbance of its own, and wrappers in an undisturbed environment that do.
+        What disturbs the sensor beside the setting, in words: this package's wrappers in an undisturbed environment, or noise
+        in an environment that nobody can ask for it. It is empty if there is nothing.
         """
         env = self.make(UNDISTURBED)
         wrappers = [type(layer).__name__ for layer in layers(env) if _disturbs(layer)]
         env.close()
-        return wrappers or ([] if self.has_noise else ["noise"])
+        if wrappers:
+            return f"what it has of its own: {' and '.join(wrappers)}"
+        return "" if self.has_noise else "any noise that it may have of its own"
 
     @property
     def has_noise(self) -> bool:
@@ -135,37 +136,28 @@ class Environment:
 
     @property
     def _own_arguments(self) -> Mapping[str, Any]:
-        """Those arguments of the environment that make a setting -> their values in training."""
-        parameters, name = self._parameters, self.env_id.rpartition(":")[2]  # which imports the module that registers it
-        registered = gym.registry[name].kwargs if name in gym.registry else {}
+        """
+        Those arguments of the environment that make a setting -> their values in training. Only this package's environments
+        have such: elsewhere an argument of the same name may mean something else, such as a control period.
+        """
+        _ = self._creator  # which imports the module that registers the environment, and says if there is none
+        if suite_of(self.env_id) is None:
+            return {}
+        parameters = self._parameters
         defaults = {argument: parameters[argument].default for argument in ARGUMENTS.values() if argument in parameters}
-        given = {
-            argument: value for argument, value in {**registered, **self.kwargs}.items() if argument in ARGUMENTS.values()
-        }
-        return {**defaults, **given}
+        return defaults | {argument: value for argument, value in self.kwargs.items() if argument in ARGUMENTS.values()}
 
     @property
     def _creator(self) -> Callable[..., gym.Env]:
-        module, colon, name = self.env_id.partition(":")
-        if colon:
-            try:
-                import_module(module)
-            except ModuleNotFoundError as error:
-                raise ValueError(f"--env {self.env_id}: there is no module {error.name!r} on Python's path.") from None
-        if colon and name not in gym.registry:
-            creator: Callable[..., gym.Env] = import_path(self.env_id)
-            return creator
-        return lambda **kwargs: gym.make(name if colon else self.env_id, **kwargs)
+        try:
+            return creator_of(self.env_id)
+        except ModuleNotFoundError as error:
+            raise ValueError(f"--env {self.env_id}: there is no module {error.name!r} on Python's path.") from None
 
     @property
     def _parameters(self) -> Mapping[str, inspect.Parameter]:
-        """Parameters of the class or function that makes the environment."""
-        creator = self._creator  # imports the environment's module
-        name = self.env_id.rpartition(":")[2]
-        if name not in gym.registry:
-            if ":" not in self.env_id:
-                gym.spec(self.env_id)  # raises an error that says which id may be meant
-            return inspect.signature(creator).parameters
+        """Parameters of the function that makes one of this package's environments."""
+        name = without_module(self.env_id)
         if is_batched(name):
             return _of_batch(name)
         entry_point = gym.registry[name].entry_point

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -55,7 +55,7 @@ def make_wrapped(env_id: str, kwargs: Mapping[str, Any], wrappers: Sequence[Mapp
     :return: wrapped environment
     :raises ValueError: if a wrapper can't be imported
     """
-    return in_wrappers(_make(env_id, kwargs), wrappers)
+    return in_wrappers(creator_of(env_id)(**kwargs), wrappers)
 
 
 def in_wrappers(env: gym.Env, wrappers: Sequence[Mapping[str, Mapping[str, Any]]]) -> gym.Env:
@@ -73,12 +73,21 @@ def in_wrappers(env: gym.Env, wrappers: Sequence[Mapping[str, Mapping[str, Any]]
     return env
 
 
-def _make(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env:
+def creator_of(env_id: str) -> Callable[..., gym.Env]:
+    """
+    Find what makes an environment. Where a module has a class or function of the name under which it registers an environment,
+    it is the registered one, with its time limit.
+
+    :param env_id: name of an environment, as :func:`make_wrapped` describes
+    :return: function that makes the environment from its keyword arguments
+    :raises ModuleNotFoundError: if there is no such module
+    """
     module, _, name = env_id.rpartition(":")
-    if module and name.isidentifier() and callable(getattr(import_module(module), name, None)):
-        env: gym.Env = import_path(env_id)(**kwargs)
-        return env
-    return gym.make(env_id, **kwargs)
+    found = getattr(import_module(module), name, None) if module else None
+    if callable(found) and name not in gym.registry:
+        creator: Callable[..., gym.Env] = found
+        return creator
+    return partial(gym.make, env_id)
 
 
 def with_history(env: gym.Env, length: int) -> gym.Env:

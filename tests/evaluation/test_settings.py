@@ -6,9 +6,9 @@ import pytest
 import yaml
 
 from sb3_gac.envs import DroppedFrames, History, SensorDelay, SensorNoise
-from sb3_gac.envs.disturbances import disturb
 from sb3_gac.envs.state import layers
 from sb3_gac.evaluation.settings import UNDISTURBED, Environment, Setting, check_fits, environment_of_run, plan
+from sb3_gac.training.environments import make_wrapped
 from tests.evaluation.helpers import ENV, Walk
 
 NOISY = "tests.evaluation.helpers:noisy_walk"
@@ -60,23 +60,39 @@ def test_what_is_trained_by_default_is_the_environments_default():
 
 
 def test_an_environment_of_ones_own_gets_wrappers_beneath_its_memory():
-    environment = Environment(NOISY, {"history": 3})
-    assert environment.trained == Setting(0.2)
+    environment = Environment(NOISY, {"history": 3, "noise_std": 0.3})
+    assert (environment.trained, environment.has_noise) == (UNDISTURBED, False)
     found = _disturbances(environment.make(Setting(0.5, 2, 0.1)))
-    assert [type(layer) for layer in found] == [History, DroppedFrames, SensorDelay, SensorNoise]
-    assert found[-1].noise_std == np.float32(0.5), "its own argument, not noise on top"
+    assert [type(layer) for layer in found] == [History, DroppedFrames, SensorDelay, SensorNoise, SensorNoise]
+    assert [layer.noise_std for layer in found[3:]] == [np.float32(0.5), np.float32(0.3)], "on top of its own"
     plain = Environment(ENV)
-    assert not plain.has_noise
     assert [type(layer) for layer in _disturbances(plain.make(Setting(0.5, 2)))] == [SensorDelay, SensorNoise]
+
+
+class Controlled(Walk):
+    """A walk whose arguments have the names of disturbances, and mean something else."""
+
+    def __init__(self, delay=0.05, drop="left", noise_std=("joints", 2)):
+        super().__init__()
+        self.arguments = delay, drop, noise_std
+
+
+def test_arguments_of_ones_own_are_no_disturbances():
+    gym.register("tests/Controlled-v0", entry_point=Controlled, kwargs={"delay": 0.1})
+    for env_id, period in {f"{__name__}:Controlled": 0.05, "tests/Controlled-v0": 0.1}.items():
+        environment = Environment(env_id, {"drop": "right"})
+        assert environment.trained == UNDISTURBED
+        for setting in (UNDISTURBED, Setting(0.5, 2, 0.1)):
+            assert environment.make(setting).unwrapped.arguments == (period, "right", ("joints", 2))
 
 
 def test_environments_that_are_not_there():
     with pytest.raises(ValueError, match="--env no_such_module:Env: there is no module 'no_such_module'"):
         _ = Environment("no_such_module:Env").trained
-    with pytest.raises(ValueError, match="has no 'Nothing'"):
+    with pytest.raises(gym.error.Error, match="Nothing"):
         Environment("tests.evaluation.helpers:Nothing").make(UNDISTURBED)
     with pytest.raises(gym.error.Error, match="HalfCheetha"):
-        _ = Environment("sb3_gac/HalfCheetha-v5").trained
+        Environment("sb3_gac/HalfCheetha-v5").make(UNDISTURBED)
     with pytest.raises(ValueError, match='Pendulum-v1 has no entry "partial"'):
         Environment("Pendulum-v1").make(UNDISTURBED)
 
@@ -109,38 +125,27 @@ def test_what_the_policy_reads_must_be_shown():
         check_fits({"goal": (2,)}, env, ENV)
 
 
-class Taking(gym.Wrapper):
-    """Whatever its maker takes, it takes."""
-
-    def __init__(self, **disturbed):
-        super().__init__(disturb(Walk(), **disturbed))
-
-
-def test_what_an_environment_is_registered_with_is_what_it_was_trained_with():
-    gym.register("tests/Disturbed-v0", entry_point=Taking, kwargs={"noise_std": 0.5, "delay": 3})
-    environment = Environment("tests/Disturbed-v0")
-    assert environment.trained == Setting(0.5, 3)
-    assert _disturbances(environment.make(UNDISTURBED)) == [] == environment.beside
-    (delay,) = _disturbances(environment.make(Setting(0.0, 1)))
-    assert delay.steps == 1, "once, by its own argument"
-    assert Environment("tests/Disturbed-v0", {"delay": 2}).trained == Setting(0.5, 2)
-
-
-def test_a_module_is_imported_before_its_registration_is_read(tmp_path, monkeypatch):
+def test_what_a_module_registers_comes_before_its_class_of_that_name(tmp_path, monkeypatch):
+    """With its time limit and arguments, in training and in evaluations."""
     source = (
-        "from tests.evaluation.test_settings import Taking, gym\ngym.register('Late-v0', Taking, kwargs={'noise_std': 0.3})\n"
+        "import gymnasium\nfrom tests.evaluation.test_settings import Controlled\nclass Cart(Controlled): pass\n"
+        "gymnasium.register('Cart', Cart, max_episode_steps=10, kwargs={'delay': 0.3})\n"
     )
     (tmp_path / "registers_late.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
-    assert Environment("registers_late:Late-v0").trained == Setting(0.3)
+    for env in (Environment("registers_late:Cart").make(UNDISTURBED), make_wrapped("registers_late:Cart", {}, [])):
+        assert isinstance(env, gym.wrappers.TimeLimit)
+        assert env.unwrapped.arguments[0] == 0.3
 
 
 def test_disturbances_that_stay_are_named():
     """A task in wrappers of one's own has them beside those of a setting."""
     wrappers = [{"sb3_gac.envs:SensorNoise": {"noise_std": 0.5}}, {"sb3_gac.envs:SensorDelay": {"steps": 2}}]
-    assert Environment("sb3_gac/Pendulum-v1", {}, wrappers).beside == ["SensorDelay", "SensorNoise"]
-    assert Environment("sb3_gac/Pendulum-v1").beside == []
-    assert Environment(ENV).beside == ["noise"], "it may have some of its own"
+    beside = Environment("sb3_gac/Pendulum-v1", {}, wrappers).beside
+    assert beside == "what it has of its own: SensorDelay and SensorNoise"
+    assert Environment(NOISY).beside == "what it has of its own: SensorNoise"
+    assert Environment("sb3_gac/Pendulum-v1").beside == ""
+    assert Environment(ENV).beside == "any noise that it may have of its own"
 
 
 @pytest.mark.parametrize("task", ["TigerDoor", "popgym-RepeatPreviousEasy"])
