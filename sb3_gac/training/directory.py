@@ -5,6 +5,7 @@ import os
 import time
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
+from datetime import date, datetime
 from inspect import isclass, isroutine
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ _OPTIONS = (
 )
 _REQUIRED = ("task", "steps", "seed", "environment")
 _PATHS = ("runs", "teacher")
+_YAML = (type(None), bool, int, float, str, bytes, date, datetime)  # beside lists, mappings and sets
 
 
 def options_of(directory: Path) -> Namespace:
@@ -129,14 +131,14 @@ def _own_kwargs(options: Namespace) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """The value in the types of YAML; other types as text."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(part) for key, part in value.items()}
+        return {key if type(key) in _YAML else str(key): _plain(part) for key, part in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
         return [_plain(getattr(part, "value", part)) for part in value]
     if isinstance(value, list | tuple):
         return [_plain(part) for part in value]
     if isclass(value) or isroutine(value):
         return f"{value.__module__}.{value.__qualname__}"
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+    return value if isinstance(value, _YAML) or type(value) is set else str(value)
 
 
 def write_at_once(path: Path, text: str) -> None:

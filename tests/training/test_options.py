@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from sb3_gac.algorithms import ALGORITHMS
 from sb3_gac.envs import PARTIAL
+from sb3_gac.evaluation.settings import environment_of_run
 from sb3_gac.train import parse_arguments
 from sb3_gac.training.directory import in_words, new_directory
 from sb3_gac.training.environments import find_modules_here
@@ -125,6 +126,16 @@ def test_an_environment_of_ones_own_has_its_arguments_and_a_history_on_request(t
     configuration = yaml.safe_load((job.directory / "config.yaml").read_text())
     assert configuration["environment"]["kwargs"] == {"mass": 2.5}
     assert configuration["arguments"]["gamma"] == 0.5
+
+
+def test_arguments_of_an_environment_are_kept_as_yaml_reads_them(tmp_path):
+    text = "{mass: {0: 1.5, 1.5: a, true: b, null: c, names: [{2: x}], 2020-01-02: 2020-01-03}}"
+    job = prepare(parse_arguments(["--env", OWN, "--env-kwargs", text, "--runs", str(tmp_path)]))
+    job.alone.close()
+    given = yaml.safe_load(text)
+    assert job.options.env_kwargs == given
+    assert parse_arguments(["--resume", str(job.directory)]).env_kwargs == given
+    assert environment_of_run(job.directory).kwargs == given
 
 
 def test_a_task_is_the_same_after_the_name_of_a_module(tmp_path):
