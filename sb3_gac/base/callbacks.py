@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
@@ -59,6 +60,11 @@ class SeededEvalCallback(EvalCallback):
         self.eval_seed = eval_seed
         self.history: list[dict[str, float]] = []
         self._episode_returns: list[float] = []
+
+    def _init_callback(self) -> None:
+        # The model wraps its own environments in this way, and SB3 copies statistics between environments wrapped alike
+        self.eval_env = BaseAlgorithm._wrap_env(self.eval_env)
+        super()._init_callback()
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:

@@ -3,6 +3,7 @@
 import os
 import re
 import warnings
+from copy import deepcopy
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, GPOPenalty, GuiderLearnerEvalCallback, SeededEvalCallback
+from tests.helpers import Sampled
 
 EPISODE_LENGTH = 5
 
@@ -104,6 +106,20 @@ def test_returns_are_those_of_the_two_policies_from_the_same_seeds(n_envs):
         assert row["guider"] == pytest.approx(guider)
         assert row["learner"] == pytest.approx(learner)
     assert callback.last_mean_reward == pytest.approx(learner)
+
+
+def test_statistics_reach_evaluations_that_show_images_with_their_channels_last():
+    """The model turns images around outside of its VecNormalize."""
+    space = spaces.Dict(partial=spaces.Box(0, 255, (36, 36, 3), np.uint8), privileged=spaces.Box(5, 9, (2,), np.float32))
+
+    def make(**options):
+        env = DummyVecEnv([lambda: Monitor(Sampled(deepcopy(space)))])
+        return VecNormalize(env, norm_obs_keys=["privileged"], norm_reward=False, **options)
+
+    eval_env = make(training=False)
+    model = _model(make(), learning_starts=100)
+    model.learn(12, callback=_callback(eval_env))
+    assert (eval_env.obs_rms["privileged"].mean > 5).all(), "as in training after ten steps, and not 0"
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
