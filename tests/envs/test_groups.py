@@ -217,6 +217,13 @@ def test_refuses_with_the_culprit_named(arguments, message):
         GroupsVecEnv(Simulator(), **arguments)
 
 
+def test_episodes_end_by_the_simulator_alone():
+    env = GroupsVecEnv(Simulator())
+    with pytest.raises(ValueError, match="time_limit can't be set, got 5: the simulator resets its environments by itself"):
+        env.set_attr("time_limit", 5)
+    assert env.get_attr("time_limit") == [None] * 4
+
+
 def test_a_final_key_that_is_not_there_is_named():
     env = GroupsVecEnv(Simulator(), final_key="final")
     with pytest.raises(ValueError, match=r'final_key="final", but episodes ended and the extras have \[\]'):

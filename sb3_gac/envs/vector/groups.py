@@ -68,6 +68,19 @@ class GroupsVecEnv(BatchVecEnv):
         self._shown: Groups = {}
         self._has_ended = np.zeros(self.num_envs, dtype=bool)
 
+    @property
+    def time_limit(self) -> int | None:  # type: ignore[override]
+        """``None``, for the simulator alone truncates episodes."""
+        return None
+
+    @time_limit.setter
+    def time_limit(self, steps: int | None) -> None:
+        if steps is not None:
+            raise ValueError(
+                f"time_limit can't be set, got {steps!r}: the simulator resets its environments by itself. Set the length of "
+                "its episodes in its own configuration."
+            )
+
     def start(self, seeds: Sequence[int]) -> Groups:
         """
         Reset the simulator by a seed.
