@@ -210,7 +210,9 @@ def check_replay_buffer_class(name: str, value: Any) -> None:
     if value is None:
         return
     if not (isinstance(value, type) and issubclass(value, ReplayBuffer)):
-        raise ValueError(f"{name} must be DictReplayBuffer, a subclass of it or None, got {value!r}.")
+        in_python = " A name can't stand for a class: train in Python with the class itself, as docs/goals.md does for HER."
+        advice = in_python if isinstance(value, str) else ""
+        raise ValueError(f"{name} must be DictReplayBuffer, a subclass of it or None, got {value!r}.{advice}")
     if value in (ReplayBuffer, NStepReplayBuffer):
         raise ValueError(
             f"{name}={value.__name__} can't hold Dict observations: leave it out, or give DictReplayBuffer or a subclass."

@@ -167,6 +167,12 @@ def test_names_of_torchs_classes_are_classes_in_overrides_too():
     assert of_policy["net_arch"] == [128, 128], "the preset's"
 
 
+def test_hindsight_is_for_python(tmp_path):
+    given = ["--overrides", "{replay_buffer_class: HerReplayBuffer}", "--runs", str(tmp_path)]
+    with pytest.raises(ValueError, match=r"got 'HerReplayBuffer'\. .* train in Python with the class itself, as docs/goals\.md"):
+        prepare(parse_arguments(given))
+
+
 def test_critics_see_the_whole_state_alone_where_privileged_is_said_to_be_it():
     options = parse_arguments(["--env", OWN, "--whole-state"])
     assert algorithm_arguments(options)["role_keys"] == {"critic": ["privileged"]}
