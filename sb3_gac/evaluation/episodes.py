@@ -1,5 +1,6 @@
 """Episodes of a policy, each from a seed of its own and independent of the others."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -7,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_gac.evaluation.policies import EvaluatedPolicy
+
+_MANY = 10_000  # steps after which an episode may be one that never ends
 
 
 class Episode(NamedTuple):
@@ -45,8 +48,16 @@ def run_episodes(
     waiting = iter(range(len(seeds)))
     slots = [_Slot(env, waiting, seeds) for env in envs]
     policy.start(len(slots))
+    steps = 0
     while any(slot.episode is not None for slot in slots):
         batch = {key: np.stack([slot.observation[key] for slot in slots]) for key in slots[0].observation}
+        steps += 1
+        if steps == _MANY and not results:
+            warnings.warn(
+                f"No episode has ended in {steps:,} steps. If the environment's episodes never end, stop, and give it a time "
+                "limit: register it with max_episode_steps, or wrap it in gymnasium.wrappers.TimeLimit.",
+                stacklevel=2,
+            )
         actions = policy.act(batch, np.array([slot.starts for slot in slots]))
         for slot, action in zip(slots, actions, strict=True):
             ended = slot.step(action)

@@ -1,9 +1,11 @@
 """Evaluation of a finished run: the learner as it is deployed, beside policies without training."""
 
+import warnings
 from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -71,6 +73,29 @@ def untrained_policies(env: VecEnv) -> dict[str, Any]:
     if isinstance(env.action_space, spaces.Box) and env.action_space.is_bounded():
         policies["the middle action"] = MiddleAction(env)
     return policies
+
+
+class EndlessEpisodesWarning(BaseCallback):
+    """
+    A callback that warns before evaluations if no episode has ended so far, for an evaluation waits for the ends of episodes.
+
+    :param env_id: id of the environment, for the message
+    :param every: number of calls between two evaluations
+    """
+
+    def __init__(self, env_id: str, every: int):
+        super().__init__()
+        self._env_id, self._every = env_id, every
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self._every == 0 and not self.model.ep_info_buffer:
+            warnings.warn(
+                f"No episode of {self._env_id} has ended in {self.num_timesteps:,} steps, and an evaluation goes on until "
+                "episodes end. If they never do, stop by Ctrl-C twice, and register the environment with max_episode_steps, "
+                "or wrap it in gymnasium.wrappers.TimeLimit.",
+                stacklevel=2,
+            )
+        return True
 
 
 def evaluate(policy: Any, env: VecEnv, episodes: int) -> tuple[float, float]:

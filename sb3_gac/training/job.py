@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gymnasium.error import Error as GymnasiumError
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common import utils
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
@@ -19,6 +20,7 @@ from sb3_gac.algorithms import algorithm_class
 from sb3_gac.checkpoint.files import checkpoints
 from sb3_gac.checkpoint.lock import locked
 from sb3_gac.deploy.statistics import STATISTICS
+from sb3_gac.envs.suites import suite_of
 from sb3_gac.presets import PRESETS
 from sb3_gac.stopping import when_stopped_say
 from sb3_gac.training.curve import draw_learning_curve
@@ -35,7 +37,7 @@ from sb3_gac.training.directory import (
     write_configuration,
 )
 from sb3_gac.training.environments import entries_of_floats, find_modules_here, make_envs, normalized
-from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, evaluate, untrained_policies
+from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, EndlessEpisodesWarning, evaluate, untrained_policies
 from sb3_gac.training.options import EPISODES_ON_THE_WAY, TEACHER, algorithm_arguments
 from sb3_gac.training.progress import Progress
 
@@ -181,11 +183,17 @@ def learn(job: Job) -> tuple[list[dict[str, float]], float]:
     if left > 0:
         root = directory / CHECKPOINTS
         checkpoint = ExactCheckpointCallback(root, every * options.envs, notes=notes, at_start=not resumed)
-        callbacks = [evaluation, checkpoint, Progress(evaluation, options.steps)]
+        endless = [EndlessEpisodesWarning(options.env_id, every)] if _has_no_time_limit(options, model.get_env()) else []
+        callbacks = [*endless, evaluation, checkpoint, Progress(evaluation, options.steps)]
         model.learn(left, callback=callbacks, reset_num_timesteps=not resumed)
         _save_checkpoint(model, root, notes())
     final = notes()
     return final["history"], final["minutes"]
+
+
+def _has_no_time_limit(options: Namespace, env: VecEnv) -> bool:
+    """Whether the environment is none of this package's, and in no wrapper that ends its episodes."""
+    return suite_of(options.env_id) is None and not any(env.env_is_wrapped(TimeLimit))
 
 
 def _evaluation_class(model: Any) -> type[SeededEvalCallback]:

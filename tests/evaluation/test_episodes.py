@@ -66,6 +66,17 @@ def test_the_end_of_each_episode_is_told():
     assert len(told) == len(SEEDS)
 
 
+def test_episodes_that_may_never_end_are_warned_of(monkeypatch):
+    monkeypatch.setattr("sb3_gac.evaluation.episodes._MANY", 5)
+
+    class Long(Walk):
+        def step(self, action):
+            return *super().step(action)[:2], False, self.steps == 9, {}
+
+    with pytest.warns(UserWarning, match=r"No episode has ended in 5 steps.*max_episode_steps"):
+        run_episodes(Remembering(), [Long()], range(2))
+
+
 def test_where_nobody_reports_successes_there_are_none():
     class Silent(Walk):
         def step(self, action):
