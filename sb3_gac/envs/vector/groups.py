@@ -69,7 +69,7 @@ class GroupsVecEnv(BatchVecEnv):
         self._has_ended = np.zeros(self.num_envs, dtype=bool)
 
     @property
-    def time_limit(self) -> int | None:  # type: ignore[override]
+    def time_limit(self) -> int | None:
         """``None``, for the simulator alone truncates episodes."""
         return None
 
