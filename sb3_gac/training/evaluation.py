@@ -77,10 +77,10 @@ def untrained_policies(env: VecEnv) -> dict[str, Any]:
 
 class EndlessEpisodesWarning(BaseCallback):
     """
-    A callback that warns before evaluations if no episode has ended so far, for an evaluation waits for the ends of episodes.
+    A callback that warns before the first evaluation if no episode has ended so far, for an evaluation goes on until they end.
 
     :param env_id: id of the environment, for the message
-    :param every: number of calls between two evaluations
+    :param every: number of calls from one evaluation to the next
     """
 
     def __init__(self, env_id: str, every: int):
@@ -88,7 +88,7 @@ class EndlessEpisodesWarning(BaseCallback):
         self._env_id, self._every = env_id, every
 
     def _on_step(self) -> bool:
-        if self.n_calls % self._every == 0 and not self.model.ep_info_buffer:
+        if self.n_calls == self._every and not self.model.ep_info_buffer:
             warnings.warn(
                 f"No episode of {self._env_id} has ended in {self.num_timesteps:,} steps, and an evaluation goes on until "
                 "episodes end. If they never do, stop by Ctrl-C twice, and register the environment with max_episode_steps, "

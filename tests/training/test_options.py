@@ -169,7 +169,9 @@ def test_names_of_torchs_classes_are_classes_in_overrides_too():
 
 def test_hindsight_is_for_python(tmp_path):
     given = ["--overrides", "{replay_buffer_class: HerReplayBuffer}", "--runs", str(tmp_path)]
-    with pytest.raises(ValueError, match=r"got 'HerReplayBuffer'\. .* train in Python with the class itself, as docs/goals\.md"):
+    with pytest.raises(
+        ValueError, match=r"got 'HerReplayBuffer'\. .* train in Python with the class itself, as docs/goals\.md"
+    ):
         prepare(parse_arguments(given))
 
 
