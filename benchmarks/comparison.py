@@ -30,7 +30,7 @@ from sb3_gac.envs.suites import SUITES, suite_of, task_of
 from sb3_gac.optim.compile import PAYS_FROM, missing_compiler
 from sb3_gac.presets import PRESETS, read_preset
 from sb3_gac.training.evaluation import untrained_policies
-from sb3_gac.training.options import from_yaml, mapping, positive
+from sb3_gac.training.options import check_steps, from_yaml, mapping, positive
 
 ALGORITHMS = (FULL, ASYMMETRIC, GUIDED, PARTIAL)
 EVALUATIONS, UNTRAINED_EPISODES = 20, 30
@@ -209,13 +209,8 @@ def run(options: argparse.Namespace) -> Path:
 
 
 def _check_steps(specs: Sequence[RunSpec]) -> None:
-    """Refuse runs that would end before the first gradient step: their returns are those of policies without training."""
     for spec in specs:
-        if spec.steps <= (first := first_gradient_step(spec)):
-            raise ValueError(
-                f"--steps: {spec.algorithm} makes its first gradient step after {first:,} steps (learning_starts), so in "
-                f'{spec.steps:,} steps nothing is learned: give more --steps, or --overrides "{{learning_starts: ...}}".'
-            )
+        check_steps(spec.algorithm, spec.steps, first_gradient_step(spec))
 
 
 def _check_goals(spec: RunSpec) -> None:

@@ -101,6 +101,15 @@ def test_a_log_that_nothing_can_write_is_refused_before_anything_is_written(tmp_
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("learning_starts", [400, 2_000])
+def test_a_run_without_a_gradient_step_is_refused_before_anything_is_written(learning_starts, tmp_path):
+    overrides = f"{{learning_starts: {learning_starts}}}"
+    message = rf"error: --steps: GAC makes its first gradient step after {learning_starts:,} steps .* in 400 steps nothing is"
+    with pytest.raises(SystemExit, match=message):
+        main([*QUICK, "--overrides", overrides, "--runs", str(tmp_path)])
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("arguments", [["--task", "Cheetah"], ["--privileged", "all"], ["--preset", "large"]])
 def test_unknown_choices_are_refused(arguments, capsys):
     with pytest.raises(SystemExit):
@@ -390,7 +399,7 @@ def test_a_directory_that_can_not_be_made_is_one_line(monkeypatch):
 
     monkeypatch.setattr(job, "write_configuration", full)
     with pytest.raises(SystemExit, match=r"error: .*No space left"):
-        main(QUICK)
+        main([*QUICK, "--overrides", "{learning_starts: 50}"])
 
 
 def test_a_model_that_could_not_be_written_whole_is_none(tmp_path):

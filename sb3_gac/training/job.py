@@ -36,7 +36,7 @@ from sb3_gac.training.directory import (
 )
 from sb3_gac.training.environments import entries_of_floats, find_modules_here, make_envs, normalized
 from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, evaluate, untrained_policies
-from sb3_gac.training.options import EPISODES_ON_THE_WAY, TEACHER, algorithm_arguments
+from sb3_gac.training.options import EPISODES_ON_THE_WAY, TEACHER, algorithm_arguments, check_steps
 from sb3_gac.training.progress import Progress
 
 EVALUATIONS = 10
@@ -91,6 +91,7 @@ def _begun(options: Namespace, env: VecEnv, held: ExitStack) -> tuple[Path, Any,
     """Directory and model of a new run, which the context keeps for this process."""
     directory = new_directory(options)
     model = _new(options, directory, env)
+    check_steps(type(model).__name__, options.steps, getattr(model, "learning_starts", 0))
     write_configuration(directory, options, model)
     held.enter_context(locked(directory, CONFIGURATION))
     return directory, model, False

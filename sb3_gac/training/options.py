@@ -351,6 +351,22 @@ def algorithm_arguments(options: Namespace) -> dict[str, Any]:
     return instantiate(merge(of_preset, merge(own, options.overrides)))
 
 
+def check_steps(name: str, steps: int, learning_starts: int) -> None:
+    """
+    Refuse a run that would end before the first gradient step: its results would be those of a policy without training.
+
+    :param name: name of the algorithm
+    :param steps: number of environment steps of the run
+    :param learning_starts: number of environment steps after which gradient steps begin
+    :raises ValueError: if the run has no step after these
+    """
+    if steps <= learning_starts:
+        raise ValueError(
+            f"--steps: {name} makes its first gradient step after {learning_starts:,} steps (learning_starts), so in "
+            f'{steps:,} steps nothing is learned: give more --steps, or --overrides "{{learning_starts: ...}}".'
+        )
+
+
 def name_of_run(options: Namespace) -> str:
     """
     :param options: options of the run, see :func:`resolve`
