@@ -6,6 +6,7 @@ import pickle
 import re
 import shlex
 import signal
+import textwrap
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -221,9 +222,14 @@ def test_a_preset_that_normalises_observations_leaves_their_statistics(tmp_path,
     (directory,) = tmp_path.iterdir()
     statistics = VecNormalize.load(str(directory / "vecnormalize.pkl"), DummyVecEnv([InvertedDoublePendulum] * 2))
     assert statistics.obs_rms["partial"].count == pytest.approx(402, abs=0.1), "of training alone"
-    assert f"is to be normalised by {directory / 'vecnormalize.pkl'}" in capsys.readouterr().out
     statistics.training = False
     model = GAC.load(directory / "model")
+    snippet = textwrap.dedent(capsys.readouterr().out.partition("To use the learner:\n")[2])
+    raw = {key: np.full(space.shape, 2.5, space.dtype) for key, space in model.observation_space.items()}
+    pasted = {"observation": raw["partial"]}
+    exec(snippet, pasted)
+    expected, _ = model.predict({"partial": statistics.normalize_obs(raw)["partial"]}, deterministic=True)
+    np.testing.assert_allclose(pasted["action"], expected, rtol=1e-5)
     assert model.trained_normalised
     results = json.loads((directory / "results.json").read_text())
     assert results["learner"] == pytest.approx(job.evaluate(DeployedView(model), statistics, 2)[0], rel=1e-3)
