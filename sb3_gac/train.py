@@ -41,7 +41,8 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> Namespace:
             return Namespace(**vars(resolve(given)), resume=None)
         if given:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise ValueError(f"--resume goes on with the options of the run: leave out {names}.")
+            anew = " A run with other options is a new one: leave out --resume."
+            raise ValueError(f"--resume goes on with the options of the run: leave out {names}.{anew}")
         return options_of(directory)
     except ValueError as error:
         parser.error(str(error))

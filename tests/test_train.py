@@ -331,15 +331,16 @@ def test_a_run_that_was_stopped_while_it_was_evaluated_is_evaluated(tmp_path, mo
 def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, capsys):
     for content, message in {
         None: "there is no config.yaml in it",
-        "config.yaml": "leave out --env-kwargs, --steps",
-        "results.json": "this run is finished",
+        "config.yaml": "leave out --env-kwargs, --steps. A run with other options is a new one: leave out --resume",
+        "results.json": f'this run is finished, its results are in results.json. Its checkpoints are gone: train anew with more '
+        f'--steps; or go on in Python with an empty replay buffer: GAC.load("{tmp_path}/model", env=env).learn(...)',
     }.items():
         if content is not None:
             (tmp_path / content).write_text("{}")
         others = ["--steps", "3", "--env-kwargs", "{}"] if content == "config.yaml" else []
         with pytest.raises(SystemExit):
             parse_arguments(["--resume", str(tmp_path), *others])
-        assert message in capsys.readouterr().err
+        assert message in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,11 @@ def check_unfinished(directory: Path) -> None:
     :raises ValueError: if the run is finished
     """
     if (directory / RESULTS).exists():
-        raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
+        raise ValueError(
+            f"--resume {directory}: this run is finished, its results are in {RESULTS}. Its checkpoints are gone: train anew with "
+            f'more --steps; or go on in Python with an empty replay buffer: GAC.load("{directory / MODEL}", env=env).learn(...), '
+            "with the class of its algorithm."
+        )
 
 
 def _configuration(directory: Path) -> Mapping[str, Any]:
