@@ -25,12 +25,13 @@ from benchmarks.run import check_unfinished
 from benchmarks.suite import NAME, RunSpec, cells_of, default_name, read_definitions, read_suite
 from benchmarks.tidy import file_of, read_tidy
 from benchmarks.yaml_checks import check_is
+from sb3_gac.command_line import from_yaml, mapping, positive
 from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 from sb3_gac.optim.compile import PAYS_FROM, missing_compiler
 from sb3_gac.presets import PRESETS, read_preset
 from sb3_gac.training.evaluation import untrained_policies
-from sb3_gac.training.options import check_steps, from_yaml, mapping, positive
+from sb3_gac.training.options import check_steps
 
 ALGORITHMS = (FULL, ASYMMETRIC, GUIDED, PARTIAL)
 EVALUATIONS, UNTRAINED_EPISODES = 20, 30

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
 from sb3_gac.base.loading import model_file
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.command_line import mapping, positive
 from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.envs.suites import SUITES, Suite, env_id_of, registered_id, suite_of, task_of
 from sb3_gac.presets import PRESETS, instantiate, merge, preset, read_preset
@@ -127,7 +127,7 @@ def _add_training(group: Any) -> None:
         "--overrides",
         type=mapping,
         metavar="YAML",
-        help='changes to the preset, such as "{gamma: 0.95, learning_rate: 1.0e-3}"; YAML reads 1e-3 as text (default: none)',
+        help='changes to the preset, such as "{gamma: 0.95, learning_rate: 1e-3}" (default: none)',
     )
     group.add_argument(
         "--normalize",
@@ -158,45 +158,6 @@ def _add_results(group: Any) -> None:
     group.add_argument(
         "--resume", type=Path, metavar="DIRECTORY", help="of a run that was stopped, to go on with it and its options"
     )
-
-
-def positive(text: str) -> int:
-    """
-    :param text: value on the command line
-    :return: number that it stands for
-    :raises argparse.ArgumentTypeError: if it is no integer, or below 1
-    """
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be an integer of at least 1, got {text}")
-    return value
-
-
-def from_yaml(text: str) -> Any:
-    """
-    :param text: value on the command line
-    :return: content of the YAML
-    :raises argparse.ArgumentTypeError: if the text is no YAML
-    """
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no YAML: {error}") from None
-
-
-def mapping(text: str) -> dict[str, Any]:
-    """
-    :param text: value on the command line
-    :return: mapping that it stands for
-    :raises argparse.ArgumentTypeError: if the text is no mapping in YAML
-    """
-    found = from_yaml(text)
-    if not isinstance(found, Mapping):
-        raise argparse.ArgumentTypeError(f'must be a mapping, such as "{{key: 0.1}}", got {text!r}')
-    return dict(found)
 
 
 def given_options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def test_help_has_the_defaults_and_needs_no_more_than_80_columns(monkeypatch):
         (["--env", "sb3_gac:sb3_gac/TigerDoor-v0", "--noise", "0.1"], "--noise: sb3_gac/TigerDoor-v0 has no such argument"),
         (["--teacher", "model.zip"], "--teacher: GAC has none"),
         (["--steps", "0"], "--steps: must be an integer of at least 1, got 0"),
-        (["--steps", "1e4"], "--steps: must be an integer of at least 1, got 1e4"),
+        (["--steps", "1e-4"], "--steps: must be an integer of at least 1, got 1e-4"),
         (["--env-kwargs", "3"], "must be a mapping"),
         (["--overrides", "{"], "is no YAML"),
     ],

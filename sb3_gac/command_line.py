@@ -1,0 +1,78 @@
+"""What the programs' command lines share: the form of their values."""
+
+import argparse
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader, which also reads numbers with an exponent that YAML 1.1 reads as text, such as 1e-3 and 1e5."""
+
+    def construct_exponential(self, node: yaml.ScalarNode) -> float:
+        """
+        :param node: plain text of a number with an exponent
+        :return: integer if the text has neither a point nor a negative exponent, else a floating-point number
+        """
+        text = self.construct_scalar(node)
+        return float(text) if "." in text or "-" in text[1:] else integer(text)
+
+
+_Loader.add_implicit_resolver("!exponential", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789"))
+_Loader.add_constructor("!exponential", _Loader.construct_exponential)
+
+
+def integer(text: str) -> int:
+    """
+    :param text: text of an integer, which may have an exponent, such as 1e5
+    :return: integer
+    :raises ValueError: if the text is of no integer
+    """
+    try:
+        return int(text)
+    except ValueError:
+        number = float(text)
+    if not number.is_integer():
+        raise ValueError(f"must be an integer, got {text}.")
+    return int(number)
+
+
+def positive(text: str) -> int:
+    """
+    :param text: value on the command line
+    :return: number that it stands for
+    :raises argparse.ArgumentTypeError: if it is no integer, or below 1
+    """
+    try:
+        value = integer(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be an integer of at least 1, got {text}")
+    return value
+
+
+def from_yaml(text: str) -> Any:
+    """
+    :param text: value on the command line
+    :return: content of the YAML, in which ``1e-3`` is a number
+    :raises argparse.ArgumentTypeError: if the text is no YAML
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no YAML: {error}") from None
+
+
+def mapping(text: str) -> dict[str, Any]:
+    """
+    :param text: value on the command line
+    :return: mapping that it stands for
+    :raises argparse.ArgumentTypeError: if the text is no mapping in YAML
+    """
+    found = from_yaml(text)
+    if not isinstance(found, Mapping):
+        raise argparse.ArgumentTypeError(f'must be a mapping, such as "{{key: 0.1}}", got {text!r}')
+    return dict(found)
