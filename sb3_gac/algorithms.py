@@ -58,7 +58,7 @@ def meant(name: str, known: Iterable[str]) -> str:
     """
     by_small_letters = {each.casefold(): each for each in known}
     words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
-    close = get_close_matches(name.casefold(), by_small_letters, n=1)
+    close = get_close_matches(name.casefold(), by_small_letters, n=1, cutoff=0.7)
     close = close or [each for each in by_small_letters if words and all(word in each for word in words)]
     return f' Is "{by_small_letters[close[0]]}" meant?' if close else ""
 

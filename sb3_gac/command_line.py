@@ -1,11 +1,69 @@
-"""What the programs' command lines share: the form of their values."""
+"""What the programs' command lines share: their parser, and the form of their values."""
 
 import argparse
 import re
-from collections.abc import Mapping
-from typing import Any
+import sys
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, NoReturn
 
 import yaml
+
+from sb3_gac.algorithms import meant
+
+#: Name under which all programs can be called
+SCRIPT = "sb3-gac"
+
+
+def called_as(module: str) -> str:
+    """
+    :param module: name of a program's module
+    :return: words with which the process's user calls the program
+    """
+    return sys.argv[0] if sys.argv[0].startswith(f"{SCRIPT} ") else f"python -m {module}"
+
+
+class Parser(argparse.ArgumentParser):
+    """
+    A parser of a program's command line. An error is told in a line of its own, without the usage that would hide it.
+
+    :param module: name of the program's module
+    :param description: docstring of the program, which the help shows as plain text
+    """
+
+    def __init__(self, module: str, description: str | None = None):
+        prog = called_as(module)
+        text = re.sub(r":\w+:`~?([^`]*)`", r"\1", description or "").replace("``", "").replace("::\n", ":\n")
+        super().__init__(
+            prog=prog,
+            description=text.replace(f"python -m {module}", prog),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+
+    def error(self, message: str) -> NoReturn:
+        """
+        End the program.
+
+        :param message: description of what is wrong with the command line
+        """
+        self.exit(2, f"{self.prog}: error: {message}\nSee {self.prog} --help.\n")
+
+
+def one_of(known: Collection[str], otherwise: str = "") -> Callable[[str], str]:
+    """
+    Make the type of an option whose values are names, of which there are too many for ``choices`` to list them.
+
+    :param known: names that the option takes
+    :param otherwise: sentence for names that are near none of these; by default it lists the names
+    :return: function of a name that returns it, or raises an ``argparse.ArgumentTypeError`` with the name that may be meant
+    """
+
+    def checked(name: str) -> str:
+        if name not in known:
+            listed = otherwise or f"There are {', '.join(known)}."
+            raise argparse.ArgumentTypeError(f'there is no "{name}".{meant(name, known) or f" {listed}"}')
+        return name
+
+    return checked
 
 
 class _Loader(yaml.SafeLoader):

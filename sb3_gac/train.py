@@ -16,6 +16,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Sequence
 
+from sb3_gac.command_line import called_as
 from sb3_gac.stopping import INTERRUPTED, last_words
 from sb3_gac.training.directory import options_of, summary
 from sb3_gac.training.job import prepare, run
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             try:
                 job = prepare(options)
             except (OSError, TypeError, ValueError) as error:
-                sys.exit(f"python -m sb3_gac.train: error: {error}")
+                sys.exit(f"{called_as('sb3_gac.train')}: error: {error}")
             run(job)
     except KeyboardInterrupt:
         _say_how_to_go_on()

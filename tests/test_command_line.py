@@ -4,7 +4,7 @@ import argparse
 
 import pytest
 
-from sb3_gac.command_line import from_yaml, mapping, positive
+from sb3_gac.command_line import Parser, from_yaml, mapping, positive
 
 
 @pytest.mark.parametrize(
@@ -31,3 +31,11 @@ def test_numbers_of_steps_may_have_an_exponent(text, value):
 def test_what_is_no_number_of_steps_is_refused(text):
     with pytest.raises(argparse.ArgumentTypeError, match="must be an integer of at least 1, got"):
         positive(text)
+
+
+def test_help_is_plain_text(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["sb3-gac train"])
+    description = "Train, see :func:`sb3_gac.zoo.main`, under ``runs/``::\n\n    python -m sb3_gac.train --task Ant\n"
+    text = Parser("sb3_gac.train", description).format_help()
+    assert "Train, see sb3_gac.zoo.main, under runs/:\n\n    sb3-gac train --task Ant\n" in text
+    assert text.startswith("usage: sb3-gac train ")

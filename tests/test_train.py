@@ -111,11 +111,28 @@ def test_a_run_without_a_gradient_step_is_refused_before_anything_is_written(lea
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [["--task", "Cheetah"], ["--privileged", "all"], ["--preset", "large"]])
-def test_unknown_choices_are_refused(arguments, capsys):
-    with pytest.raises(SystemExit):
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--task", "HalfCheetah-v5"], '--task: there is no "HalfCheetah-v5". Is "HalfCheetah" meant?'),
+        (["--task", "Quadrotor"], "lists the tasks. Every other environment goes by --env."),
+        (["--privileged", "all"], "invalid choice: 'all'"),
+        (["--preset", "lagre"], '--preset: there is no "lagre". There are learner-memory, linear-memory, '),
+        (["--algorithm", "sac_asym"], 'Is "asymmetric_sac" meant?'),
+        (["--stepps", "3"], "unrecognized arguments: --stepps 3"),
+    ],
+)
+@pytest.mark.parametrize("called", ["sb3-gac train", "/place/sb3_gac/train.py"])
+def test_what_is_wrong_with_an_option_is_a_line_and_not_the_usage(arguments, message, called, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", [called, *arguments])
+    name = called if called.startswith("sb3-gac") else "python -m sb3_gac.train"
+    with pytest.raises(SystemExit) as end:
         parse_arguments(arguments)
-    assert "invalid choice" in capsys.readouterr().err
+    assert end.value.code == 2
+    error, where = capsys.readouterr().err.splitlines()
+    assert error.startswith(f"{name}: error: ")
+    assert message in error
+    assert where == f"See {name} --help."
 
 
 def test_a_preset_brings_its_number_of_environments():
@@ -332,8 +349,8 @@ def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, capsys):
     for content, message in {
         None: "there is no config.yaml in it",
         "config.yaml": "leave out --env-kwargs, --steps. A run with other options is a new one: leave out --resume",
-        "results.json": f'this run is finished, its results are in results.json. Its checkpoints are gone: train anew with more '
-        f'--steps; or go on in Python with an empty replay buffer: GAC.load("{tmp_path}/model", env=env).learn(...)',
+        "results.json": "this run is finished, its results are in results.json. Its checkpoints are gone: train anew with "
+        f'more --steps; or go on in Python with an empty replay buffer: GAC.load("{tmp_path}/model", env=env).learn(...)',
     }.items():
         if content is not None:
             (tmp_path / content).write_text("{}")

@@ -5,9 +5,9 @@ Print the registered environments with suites, shapes and installation; with ``-
     python -m sb3_gac.envs Go1 --speed --envs 1 16 128
 """
 
-import argparse
 import sys
 
+from sb3_gac.command_line import Parser
 from sb3_gac.envs.table import Row, in_columns, rows, steps_per_second
 
 
@@ -17,9 +17,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     :param arguments: command-line arguments, ``None`` for those of the process
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_gac.envs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("sb3_gac.envs", __doc__)
     parser.add_argument("matching", nargs="?", default="", help="only ids that contain this, in small or capital letters")
     parser.add_argument("--speed", action="store_true", help="measure those that are installed")
     parser.add_argument(

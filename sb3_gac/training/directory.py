@@ -65,9 +65,9 @@ def check_unfinished(directory: Path) -> None:
     """
     if (directory / RESULTS).exists():
         raise ValueError(
-            f"--resume {directory}: this run is finished, its results are in {RESULTS}. Its checkpoints are gone: train anew with "
-            f'more --steps; or go on in Python with an empty replay buffer: GAC.load("{directory / MODEL}", env=env).learn(...), '
-            "with the class of its algorithm."
+            f"--resume {directory}: this run is finished, its results are in {RESULTS}. Its checkpoints are gone: train anew "
+            "with more --steps; or go on in Python with an empty replay buffer: "
+            f'GAC.load("{directory / MODEL}", env=env).learn(...), with the class of its algorithm.'
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
 from sb3_gac.base.loading import model_file
 from sb3_gac.checks.arguments import constructor_parameters
-from sb3_gac.command_line import mapping, positive
+from sb3_gac.command_line import Parser, mapping, one_of, positive
 from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.envs.suites import SUITES, Suite, env_id_of, registered_id, suite_of, task_of
 from sb3_gac.presets import PRESETS, instantiate, merge, preset, read_preset
@@ -50,9 +50,7 @@ def make_parser(description: str | None = None) -> argparse.ArgumentParser:
     :param description: description of the program, for its help
     :return: parser of the command line, which sets options that are not given to ``None``
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_gac.train", description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("sb3_gac.train", description)
     _add_environment(parser.add_argument_group("what to train on"))
     _add_training(parser.add_argument_group("how to train"))
     _add_results(parser.add_argument_group("what is left of it"))
@@ -63,7 +61,7 @@ def _add_environment(group: Any) -> None:
     tasks = sorted(task_of(env_id) for suite in SUITES.values() if suite.sensor_noise for env_id in suite.environments)
     group.add_argument(
         "--task",
-        choices=tasks,
+        type=one_of(tasks, "sb3-gac envs lists the tasks. Every other environment goes by --env."),
         metavar="TASK",
         help=f"registered task that takes --noise, one of {', '.join(tasks)}; other registered tasks go by --env, and "
         f"sb3-gac envs lists them (default: {DEFAULTS['task']})",
@@ -106,7 +104,7 @@ def _add_environment(group: Any) -> None:
 def _add_training(group: Any) -> None:
     group.add_argument(
         "--algorithm",
-        choices=list(ALGORITHMS),
+        type=one_of(list(ALGORITHMS)),
         metavar="NAME",
         help=f"one of {', '.join(ALGORITHMS)} (default: {DEFAULTS['algorithm']})",
     )
@@ -120,8 +118,9 @@ def _add_training(group: Any) -> None:
     group.add_argument("--envs", type=positive, help="environments side by side (default: as many as the preset is for)")
     group.add_argument(
         "--preset",
-        choices=sorted(PRESETS),
-        help="arguments of the algorithm (default: those for the task's suite, or small)",
+        type=one_of(sorted(PRESETS)),
+        metavar="NAME",
+        help=f"arguments of the algorithm: {', '.join(sorted(PRESETS))} (default: those for the task's suite, or small)",
     )
     group.add_argument(
         "--overrides",
