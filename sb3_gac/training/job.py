@@ -34,7 +34,7 @@ from sb3_gac.training.directory import (
     write_at_once,
     write_configuration,
 )
-from sb3_gac.training.environments import entries_of_floats, find_modules_here, make_envs, normalized
+from sb3_gac.training.environments import check_split, entries_of_floats, find_modules_here, make_envs, normalized
 from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, evaluate, untrained_policies
 from sb3_gac.training.options import EPISODES_ON_THE_WAY, TEACHER, algorithm_arguments, check_steps
 from sb3_gac.training.progress import Progress
@@ -71,6 +71,8 @@ def prepare(options: Namespace) -> Job:
     _check_log(options)
     set_random_seed(options.seed)
     env, eval_env = open_environments(options)
+    if options.task is None and "role_keys" not in options.overrides:
+        check_split(options.env_id, env.observation_space)
     with ExitStack() as held:
         begin = _begun if options.resume is None else _taken_up
         directory, model, goes_on = begin(options, env, held)

@@ -268,6 +268,16 @@ def test_runs_without_a_gradient_step_are_refused(steps, overrides, engine, monk
     assert first_gradient_step(replace(specs[0], algorithm="sb3-sac", preset="sb3", overrides={})) == 2_000
 
 
+@pytest.mark.parametrize(("name", "wrapper"), [("make_foreign", "SplitObservation"), ("make_unsplit", "SplitDictObservation")])
+def test_an_environment_whose_observations_are_not_split_is_refused_without_the_words_of_a_suite(
+    name, wrapper, engine, monkeypatch
+):
+    env_id = f"tests.training.test_options:{name}"
+    with pytest.raises(SystemExit, match=rf"^--env: the observations of {env_id} .* returns sb3_gac.envs.{wrapper}\("):
+        _compare(monkeypatch, "--env", env_id)
+    assert engine.made == 0
+
+
 def test_what_can_be_deployed_is_decided_by_what_the_deployed_policy_reads():
     names = ("sac-full", "sac-asym", "gac", "sac", "sb3-sac", "gpo-clip", "rma", "tgrl", "dreamer-v3")
     spec = replace(_specs("--env", "m:make")[0], overrides={"role_keys": None}, environment=None, task="Hopper")
