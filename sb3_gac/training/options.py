@@ -151,7 +151,10 @@ def _add_results(group: Any) -> None:
         help=f"of the last evaluation (default: {DEFAULTS['episodes']}); those on the way have {EPISODES_ON_THE_WAY}",
     )
     group.add_argument(
-        "--tensorboard", action="store_true", default=None, help="log for TensorBoard in the run's directory (default: no)"
+        "--tensorboard",
+        action="store_true",
+        default=None,
+        help="log for TensorBoard in the run's directory, which needs pip install tensorboard (default: no)",
     )
     group.add_argument("--runs", type=Path, help=f"where runs have their directories (default: {DEFAULTS['runs']})")
     group.add_argument(
