@@ -8,7 +8,7 @@ Print the registered environments with suites, shapes and installation; with ``-
 import sys
 
 from sb3_gac.command_line import Parser
-from sb3_gac.envs.table import Row, in_columns, rows, steps_per_second
+from sb3_gac.envs.table import Row, by_suite, in_columns, rows, steps_per_second
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
     numbers = options.envs if options.speed else []
     header = ["id", *Row._fields[1:], *(f"steps/s, {number}" for number in numbers)]
     lines = [[*row, *(_speed(row, number, options.seconds) for number in numbers)] for row in found]
-    print(in_columns(header, lines))
+    print(by_suite(header, lines, bool(options.matching)) if sys.stdout.isatty() else in_columns(header, lines))
 
 
 def _speed(row: Row, n_envs: int, seconds: float) -> str:
