@@ -35,8 +35,8 @@ def _instead(directory: Path) -> str:
         return f", but other models: give one of {', '.join(others)}."
     if (directory / "config.yaml").is_file():
         return (
-            f": the run has not finished. sb3-gac train --resume {directory} goes on with it; a run of the benchmarks goes on by "
-            "the command that started it."
+            f": the run has not finished. sb3-gac train --resume {directory} goes on with it; a run of the benchmarks goes on "
+            "by the command that started it."
         )
     return ": the run has not finished, or this is another directory."
 
