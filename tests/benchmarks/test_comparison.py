@@ -316,7 +316,7 @@ def test_what_can_be_deployed_is_decided_by_what_the_deployed_policy_reads():
         (["--seeds", "0"], "must be an integer of at least 1"),
         (["--env-kwargs", "noise"], "must be a mapping"),
         (["--env-kwargs", "{noise: ["], "is no YAML"),
-        (["--algorithms", "ppo"], "invalid choice: 'ppo'"),
+        (["--algorithms", "ppo"], 'there is no "ppo"'),
     ],
 )
 def test_bad_options_are_named(capsys, arguments, message):
