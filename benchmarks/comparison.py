@@ -25,12 +25,14 @@ from benchmarks.run import check_unfinished
 from benchmarks.suite import NAME, RunSpec, cells_of, default_name, read_definitions, read_suite
 from benchmarks.tidy import file_of, read_tidy
 from benchmarks.yaml_checks import check_is
+from sb3_gac.command_line import Parser, from_yaml, mapping, one_of, positive
 from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
 from sb3_gac.optim.compile import PAYS_FROM, missing_compiler
 from sb3_gac.presets import PRESETS, read_preset
+from sb3_gac.training.environments import check_split
 from sb3_gac.training.evaluation import untrained_policies
-from sb3_gac.training.options import from_yaml, mapping, positive
+from sb3_gac.training.options import check_steps
 
 ALGORITHMS = (FULL, ASYMMETRIC, GUIDED, PARTIAL)
 EVALUATIONS, UNTRAINED_EPISODES = 20, 30
@@ -44,9 +46,7 @@ def parse_arguments(description: str | None, arguments: Sequence[str] | None = N
     :param arguments: command-line arguments, by default those of the process
     :return: options of the comparison
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_gac.compare", description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("sb3_gac.compare", description)
     known = sorted(read_definitions())
     parser.add_argument(
         "--env", required=True, help="an id, my_module:MyEnv-v0, or my_module:make_env, a class or function that makes one"
@@ -66,12 +66,14 @@ def parse_arguments(description: str | None, arguments: Sequence[str] | None = N
         help="the privileged entry has all that partial shows: critics then see it alone, and no sensor noise",
     )
     parser.add_argument(
-        "--algorithms", nargs="+", default=ALGORITHMS, choices=known, metavar="NAME", help=f"of {', '.join(known)}"
+        "--algorithms", nargs="+", default=ALGORITHMS, type=one_of(known), metavar="NAME", help=f"of {', '.join(known)}"
     )
     parser.add_argument("--seeds", type=positive, default=5, help="runs of each algorithm (default: 5)")
     parser.add_argument("--steps", type=positive, default=20_000, help="of each run (default: 20000)")
     parser.add_argument("--eval-episodes", type=positive, default=10, help="of each evaluation (default: 10)")
-    parser.add_argument("--preset", choices=sorted(PRESETS), help="arguments of the algorithms (default: small)")
+    parser.add_argument(
+        "--preset", type=one_of(sorted(PRESETS)), metavar="NAME", help=f"of {', '.join(sorted(PRESETS))} (default: small)"
+    )
     parser.add_argument("--overrides", type=mapping, default={}, metavar="YAML", help='of the preset, such as "{gamma: 0.95}"')
     parser.add_argument("--jobs", type=positive, help="runs side by side (default: one on each CPU)")
     parser.add_argument("--ray", nargs="?", const="auto", metavar="ADDRESS", help="run on a Ray cluster instead")
@@ -189,6 +191,7 @@ def run(options: argparse.Namespace) -> Path:
     # The processes of runs start in another folder, and must find the modules that this one finds
     os.environ["PYTHONPATH"] = os.pathsep.join([os.getcwd(), *filter(None, [os.environ.get("PYTHONPATH")])])
     specs = [spec for cell in cells_of(SUITE, yaml.safe_load(_as_yaml(options))) for spec in cell]
+    _check_split(specs[0])
     check_runs(SUITE, specs)
     _check_steps(specs)
     jobs, finished = launch.jobs_of(specs, options.out / SUITE, runs)
@@ -209,13 +212,20 @@ def run(options: argparse.Namespace) -> Path:
 
 
 def _check_steps(specs: Sequence[RunSpec]) -> None:
-    """Refuse runs that would end before the first gradient step: their returns are those of policies without training."""
     for spec in specs:
-        if spec.steps <= (first := first_gradient_step(spec)):
-            raise ValueError(
-                f"--steps: {spec.algorithm} makes its first gradient step after {first:,} steps (learning_starts), so in "
-                f'{spec.steps:,} steps nothing is learned: give more --steps, or --overrides "{{learning_starts: ...}}".'
-            )
+        check_steps(spec.algorithm, spec.steps, first_gradient_step(spec))
+
+
+def _check_split(spec: RunSpec) -> None:
+    """Refuse an environment without the entries that every algorithm here reads, in words for who gave it by ``--env``."""
+    if spec.environment is None or spec.overrides.get("role_keys"):
+        return
+    try:
+        env = make_envs(spec, 1)
+    except Exception:  # the check of the runs says what is wrong
+        return
+    env.close()
+    check_split(spec.environment["id"], env.observation_space)
 
 
 def _check_goals(spec: RunSpec) -> None:

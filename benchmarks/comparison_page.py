@@ -4,6 +4,7 @@ import html
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -76,8 +77,9 @@ def _curves(tidy: pd.DataFrame, floor: str, floor_return: float) -> graph_object
         for line in lines:
             line.showlegend = line.name == algorithm
         figure.add_traces(lines)
-    note = {"annotation_text": f"{floor}, without training", "annotation_position": "bottom right"}
-    figure.add_hline(y=floor_return, line={"color": "#888", "width": 1, "dash": "dot"}, **note)
+    ends = [tidy.timesteps.min(), tidy.timesteps.max()]
+    style: dict[str, Any] = {"mode": "lines", "line": {"color": "#888", "width": 1, "dash": "dot"}, "hoverinfo": "skip"}
+    figure.add_scatter(x=ends, y=[floor_return] * 2, name=f"{floor}, without training", **style)
     shown = _shown(tidy, floor_return)
     return figure.update_layout(xaxis_title=STEPS, yaxis_title=RETURN, yaxis_range=shown, **_FRAME)
 
@@ -104,7 +106,8 @@ def _headroom(tidy: pd.DataFrame) -> graph_objects.Figure:
 
 
 def _ends_table(found: Worth) -> str:
-    best = max(found.deployable or list(found.ends), key=lambda name: float(found.ends[name].mean()))
+    learned = [name for name in found.deployable or found.ends if name in found.learned]
+    best = max(learned, key=lambda name: float(found.ends[name].mean()), default=None)
     rows = []
     for name, ends in sorted(found.ends.items(), key=lambda item: -float(item[1].mean())):
         mean, low, high = mean_interval(ends)

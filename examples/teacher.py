@@ -20,13 +20,18 @@ def main(steps: int = 20_000) -> None:
 
     model = AsymmetricSAC("MultiInputPolicy", env, seed=0, **arguments)
     shown = demonstrate(teacher, env, steps // 4)
-    print("cloned:", clone_behaviour(model, shown, gradient_steps=steps // 10))
+    tell("cloned", clone_behaviour(model, shown, gradient_steps=steps // 10))
     shown += demonstrate(teacher, env, steps // 4, student=model)
-    print("... and corrected where it went:", clone_behaviour(model, shown, gradient_steps=steps // 10))
+    tell("corrected where it went", clone_behaviour(model, shown, gradient_steps=steps // 10))
     for name, policy in (("teacher", teacher), ("clone", model)):
         print(f"the {name} returns {evaluate_policy(policy, env, n_eval_episodes=4)[0]:.0f}")
     model.learn(steps)
     print(f"trained on, it returns {evaluate_policy(model, env, n_eval_episodes=4)[0]:.0f}")
+
+
+def tell(what: str, error: dict[str, float]) -> None:
+    """Print the error of a clone before and after its training."""
+    print(f"{what}: mean squared error of actions {error['before']:.3f} before, {error['after']:.3f} after")
 
 
 if __name__ == "__main__":

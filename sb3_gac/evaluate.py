@@ -28,6 +28,7 @@ import torch as th
 from tqdm import tqdm
 
 from sb3_gac.base.loading import MODEL, load_model, model_file
+from sb3_gac.command_line import Parser, mapping
 from sb3_gac.deploy.statistics import STATISTICS, normalizer_of
 from sb3_gac.envs.table import in_columns
 from sb3_gac.evaluation.episodes import Episode, run_episodes
@@ -53,7 +54,6 @@ from sb3_gac.evaluation.settings import (
 )
 from sb3_gac.evaluation.video import VIDEOS, check_can_film, film
 from sb3_gac.stopping import StoppedInALine
-from sb3_gac.training.options import mapping
 from sb3_gac.training.provenance import provenance
 
 EVAL_SEED = 10_000
@@ -68,7 +68,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     :param arguments: command-line arguments, ``None`` for those of the process
     :return: options; ``asked`` has the values of noise, delay and drop that were given, by name
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser("sb3_gac.evaluate", __doc__)
     parser.add_argument(
         "model",
         type=Path,

@@ -16,6 +16,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Sequence
 
+from sb3_gac.command_line import called_as
 from sb3_gac.stopping import INTERRUPTED, last_words
 from sb3_gac.training.directory import options_of, summary
 from sb3_gac.training.job import prepare, run
@@ -41,7 +42,8 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> Namespace:
             return Namespace(**vars(resolve(given)), resume=None)
         if given:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise ValueError(f"--resume goes on with the options of the run: leave out {names}.")
+            anew = " A run with other options is a new one: leave out --resume."
+            raise ValueError(f"--resume goes on with the options of the run: leave out {names}.{anew}")
         return options_of(directory)
     except ValueError as error:
         parser.error(str(error))
@@ -59,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             try:
                 job = prepare(options)
             except (OSError, TypeError, ValueError) as error:
-                sys.exit(f"python -m sb3_gac.train: error: {error}")
+                sys.exit(f"{called_as('sb3_gac.train')}: error: {error}")
             run(job)
     except KeyboardInterrupt:
         _say_how_to_go_on()

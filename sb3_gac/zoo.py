@@ -22,6 +22,7 @@ from typing import Any
 import yaml
 
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class, name_of
+from sb3_gac.command_line import Parser
 from sb3_gac.envs.suites import SUITES
 from sb3_gac.envs.suites.extras import missing_extra
 from sb3_gac.presets import merge, read_preset
@@ -191,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: name of a script and its options; ``None`` for those of the process
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser("sb3_gac.zoo", __doc__)
     parser.add_argument("script", choices=list(SCRIPTS))
     own, options = parser.parse_known_args(list(sys.argv[1:] if arguments is None else arguments)[:1])
     options = list(sys.argv[2:] if arguments is None else arguments[1:])

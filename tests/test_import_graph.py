@@ -19,13 +19,16 @@ ROOMS = {
     "replay": "replay|checks",
     "checkpoint": "checkpoint|envs",
     "base": "algorithms|base|math|checks|schedules|optim|networks|replay|checkpoint|envs",
-    "deploy": "deploy|base|checks|networks|envs|learner|version|stopping",
+    "deploy": "deploy|base|checks|networks|envs|learner|version|stopping|command_line",
     "evaluation": "evaluation|algorithms|base|envs|learner|training\\.environments",
 }
 DRAWING = "page|intervals|bootstrap|tidy"
 FORBIDDEN = {
     **{f"sb3_gac/{room}/**/*.py": rf"sb3_gac(?!\.({allowed})\b)" for room, allowed in ROOMS.items()},
-    **{f"sb3_gac/envs/{path}.py": r"torch\b|stable_baselines3|sb3_gac(?!\.envs\b)" for path in ("*", "suites/**/*")},
+    **{
+        f"sb3_gac/envs/{path}.py": r"torch\b|stable_baselines3|sb3_gac(?!\.(envs|command_line)\b)"
+        for path in ("*", "suites/**/*")
+    },
     "sb3_gac/envs/vector/**/*.py": r"sb3_gac(?!\.envs\b)",
     **{
         f"sb3_gac/baselines/{pattern.format(name)}": rf"sb3_gac(?!\.({ROOMS['base']}|version|baselines\.{name})\b)"

@@ -111,6 +111,23 @@ def test_an_unknown_task_is_an_error_that_names_the_nearest(name, nearest):
             named()
 
 
+@pytest.mark.parametrize("name", ["Drone-v0", "MyRobot", "quadrotor"])
+def test_no_task_is_called_near_that_is_not(name):
+    message = rf"^task must be one of [^;]* lists, got '{name}'\. For an environment of your own, leave task out\.$"
+    with pytest.raises(ValueError, match=message):
+        preset("small", task=name)
+
+
+def test_the_preset_and_the_algorithm_that_may_be_meant_are_named():
+    with pytest.raises(ValueError, match=r"got 'smal'\. Is \"small\" meant\?$"):
+        preset("smal")
+    for name, nearest in {"sac_asym": "asymmetric_sac", "SAC-asym": "asymmetric_sac", "GAC": "gac", "tglr": "tgrl"}.items():
+        with pytest.raises(ValueError, match=rf"got '{name}'\. Is \"{nearest}\" meant\?$"):
+            preset("small", algorithm=name)
+    with pytest.raises(ValueError, match=r"got 'dreamer'\.$"):
+        preset("small", algorithm="dreamer")
+
+
 def test_an_environment_that_somebody_else_registers_is_a_task(monkeypatch):
     monkeypatch.setitem(gymnasium.registry, "sb3_gac/Mine-v3", gymnasium.spec("CartPole-v1"))
     assert env_id_of("Mine") == env_id_of("Mine-v3") == "sb3_gac/Mine-v3"

@@ -6,6 +6,7 @@ import pickle
 import re
 import shlex
 import signal
+import textwrap
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -101,11 +102,37 @@ def test_a_log_that_nothing_can_write_is_refused_before_anything_is_written(tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [["--task", "Cheetah"], ["--privileged", "all"], ["--preset", "large"]])
-def test_unknown_choices_are_refused(arguments, capsys):
-    with pytest.raises(SystemExit):
+@pytest.mark.parametrize("learning_starts", [400, 2_000])
+def test_a_run_without_a_gradient_step_is_refused_before_anything_is_written(learning_starts, tmp_path):
+    overrides = f"{{learning_starts: {learning_starts}}}"
+    message = rf"error: --steps: GAC makes its first gradient step after {learning_starts:,} steps .* in 400 steps nothing is"
+    with pytest.raises(SystemExit, match=message):
+        main([*QUICK, "--overrides", overrides, "--runs", str(tmp_path)])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--task", "HalfCheetah-v5"], '--task: there is no "HalfCheetah-v5". Is "HalfCheetah" meant?'),
+        (["--task", "Quadrotor"], "lists the tasks. Every other environment goes by --env."),
+        (["--privileged", "all"], "invalid choice: 'all'"),
+        (["--preset", "lagre"], '--preset: there is no "lagre". There are learner-memory, linear-memory, '),
+        (["--algorithm", "sac_asym"], 'Is "asymmetric_sac" meant?'),
+        (["--stepps", "3"], "unrecognized arguments: --stepps 3"),
+    ],
+)
+@pytest.mark.parametrize("called", ["sb3-gac train", "/place/sb3_gac/train.py"])
+def test_what_is_wrong_with_an_option_is_a_line_and_not_the_usage(arguments, message, called, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", [called, *arguments])
+    name = called if called.startswith("sb3-gac") else "python -m sb3_gac.train"
+    with pytest.raises(SystemExit) as end:
         parse_arguments(arguments)
-    assert "invalid choice" in capsys.readouterr().err
+    assert end.value.code == 2
+    error, where = capsys.readouterr().err.splitlines()
+    assert error.startswith(f"{name}: error: ")
+    assert message in error
+    assert where == f"See {name} --help."
 
 
 def test_a_preset_brings_its_number_of_environments():
@@ -212,9 +239,14 @@ def test_a_preset_that_normalises_observations_leaves_their_statistics(tmp_path,
     (directory,) = tmp_path.iterdir()
     statistics = VecNormalize.load(str(directory / "vecnormalize.pkl"), DummyVecEnv([InvertedDoublePendulum] * 2))
     assert statistics.obs_rms["partial"].count == pytest.approx(402, abs=0.1), "of training alone"
-    assert f"is to be normalised by {directory / 'vecnormalize.pkl'}" in capsys.readouterr().out
     statistics.training = False
     model = GAC.load(directory / "model")
+    snippet = textwrap.dedent(capsys.readouterr().out.partition("To use the learner:\n")[2])
+    raw = {key: np.full(space.shape, 2.5, space.dtype) for key, space in model.observation_space.items()}
+    pasted = {"observation": raw["partial"]}
+    exec(snippet, pasted)
+    expected, _ = model.predict({"partial": statistics.normalize_obs(raw)["partial"]}, deterministic=True)
+    np.testing.assert_allclose(pasted["action"], expected, rtol=1e-5)
     assert model.trained_normalised
     results = json.loads((directory / "results.json").read_text())
     assert results["learner"] == pytest.approx(job.evaluate(DeployedView(model), statistics, 2)[0], rel=1e-3)
@@ -316,15 +348,16 @@ def test_a_run_that_was_stopped_while_it_was_evaluated_is_evaluated(tmp_path, mo
 def test_what_there_is_nothing_to_go_on_with_is_refused(tmp_path, capsys):
     for content, message in {
         None: "there is no config.yaml in it",
-        "config.yaml": "leave out --env-kwargs, --steps",
-        "results.json": "this run is finished",
+        "config.yaml": "leave out --env-kwargs, --steps. A run with other options is a new one: leave out --resume",
+        "results.json": "this run is finished, its results are in results.json. Its checkpoints are gone: train anew with "
+        f'more --steps; or go on in Python with an empty replay buffer: GAC.load("{tmp_path}/model", env=env).learn(...)',
     }.items():
         if content is not None:
             (tmp_path / content).write_text("{}")
         others = ["--steps", "3", "--env-kwargs", "{}"] if content == "config.yaml" else []
         with pytest.raises(SystemExit):
             parse_arguments(["--resume", str(tmp_path), *others])
-        assert message in capsys.readouterr().err
+        assert message in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(
@@ -390,7 +423,7 @@ def test_a_directory_that_can_not_be_made_is_one_line(monkeypatch):
 
     monkeypatch.setattr(job, "write_configuration", full)
     with pytest.raises(SystemExit, match=r"error: .*No space left"):
-        main(QUICK)
+        main([*QUICK, "--overrides", "{learning_starts: 50}"])
 
 
 def test_a_model_that_could_not_be_written_whole_is_none(tmp_path):

@@ -32,7 +32,7 @@ from sb3_gac.checks.arguments import (
     check_arguments,
     make_arguments_plain,
 )
-from sb3_gac.checks.policy import check_policy_kwargs
+from sb3_gac.checks.policy import check_policy_kwargs, check_taken
 from sb3_gac.checks.requirements import warn_of_an_unseen_goal
 from sb3_gac.checks.scale import check_same_scale, check_same_statistics
 from sb3_gac.checks.values import plain
@@ -161,6 +161,7 @@ class AsymmetricAlgorithm(
 
     def _all_policy_kwargs(self) -> dict[str, Any]:
         own, given = self._policy_options(), present_names(self.policy_class, self.policy_kwargs, "policy_kwargs")
+        check_taken("policy_kwargs", self.policy_class, given)
         for name in sorted(own.keys() & given.keys() - set(self.policy_arguments)):
             raise ValueError(f"policy_kwargs has {name}, which is an argument of {type(self).__name__}: pass it as that.")
         return {**own, **given}

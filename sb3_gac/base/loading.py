@@ -21,12 +21,24 @@ def model_file(path: Path) -> Path:
     """
     if path.is_dir():
         if not (path / MODEL).exists():
-            raise FileNotFoundError(f"{path} has no {MODEL}: the run has not finished, or this is another directory.")
+            raise FileNotFoundError(f"{path} has no {MODEL}{_instead(path)}")
         return path / MODEL
     for file in (path, path.with_name(f"{path.name}.zip")):
         if file.is_file():
             return file
     raise FileNotFoundError(f"There is no file or directory {path}.")
+
+
+def _instead(directory: Path) -> str:
+    """The end of the message about a directory without a model: what is in it, and what to do."""
+    if others := sorted(str(file) for file in directory.glob("*.zip")):
+        return f", but other models: give one of {', '.join(others)}."
+    if (directory / "config.yaml").is_file():
+        return (
+            f": the run has not finished. sb3-gac train --resume {directory} goes on with it; a run of the benchmarks goes on "
+            "by the command that started it."
+        )
+    return ": the run has not finished, or this is another directory."
 
 
 def class_of_model(path: Path, device: th.device | str = "cpu") -> Any:

@@ -12,6 +12,12 @@ from sb3_gac.checks.values import plain
 
 #: Attributes that are kept with a model although they are no arguments of its constructor
 SETTINGS = ("strict_deployment",)
+_NO_GSDE = (
+    "There is no state-dependent exploration (gSDE), whose standard deviation depends on the features of one policy, while "
+    "guider and learner share theirs. Leave it out."
+)
+#: Argument of SB3's algorithms that those of this package do not have -> the reason, and what to do
+_OF_SB3 = dict.fromkeys(("use_sde", "sde_sample_freq", "use_sde_at_warmup"), _NO_GSDE) | {"n_envs": "It follows from env."}
 PACKAGE = __name__.partition(".")[0]
 
 
@@ -84,10 +90,12 @@ def _unknown(kind: type, name: str, where: str, known: Sequence[str]) -> TypeErr
     close = difflib.get_close_matches(name, known, n=1)
     if name in constructor_parameters(policy_class):
         hint = "It is one of policy_kwargs."
-    elif name == "n_envs":
-        hint = "It follows from env."
+    elif name in _OF_SB3:
+        hint = _OF_SB3[name]
+    elif name in SETTINGS:
+        hint = "Set it on the model itself."
     else:
-        hint = f'Is "{close[0]}" meant?' if close else "Set what is no argument on the model itself."
+        hint = f'Is "{close[0]}" meant?' if close else f"It takes {', '.join(known)}."
     return TypeError(f'{where} got "{name}", which is no argument of {kind.__name__}. {hint}')
 
 

@@ -10,7 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_gac.checkpoint.rows import SavedBlocks, read_rows, write_rows
-from sb3_gac.checks.policy import check_replay_buffer_kwargs
+from sb3_gac.checks.policy import check_taken
 from sb3_gac.checks.spaces import check_spaces_of
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
 from sb3_gac.replay.episodes import EpisodeReplayBuffer, check_learns_from_sequences
@@ -47,7 +47,7 @@ class ReplayData(OffPolicyAlgorithm):
         return self.replay_buffer_class or default
 
     def _check_replay_buffer_kwargs(self) -> None:
-        check_replay_buffer_kwargs(self._present_buffer_class, self.replay_buffer_kwargs)
+        check_taken("replay_buffer_kwargs", self._present_buffer_class, self.replay_buffer_kwargs)
         for name in ("n_steps", "gamma"):
             value, own = self.replay_buffer_kwargs.get(name), getattr(self, name)
             if value is not None and value != own:

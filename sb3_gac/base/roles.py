@@ -107,7 +107,8 @@ def resolve_role_keys(
     if roles.deployed not in role_keys and PARTIAL not in entries:
         raise ValueError(
             f'The observation has no entry "{PARTIAL}" (its entries are {list(entries)}). Rename the entry that the '
-            f'{roles.deployed} may see to "{PARTIAL}", or name it with role_keys={{"{roles.deployed}": ["<entry>"]}}.'
+            f'{roles.deployed} may see to "{PARTIAL}", join several by sb3_gac.envs.SplitDictObservation, or '
+            f'name it with role_keys={{"{roles.deployed}": ["<entry>"]}}.'
         )
     resolved = dict.fromkeys(roles.networks, entries) | {roles.deployed: (PARTIAL,)}
     resolved |= dict.fromkeys(roles.unprivileged, tuple(role_keys.get(roles.deployed, (PARTIAL,))))

@@ -42,10 +42,12 @@ class DeploymentGuard(BaseAlgorithm):
         now = entries_normalised_by(self.env)
         before = self.normalised_entries
         if self._n_updates and before is not None and set(now) != set(before):
+            then = f"whose entries {list(before)} VecNormalize normalised" if before else "that nothing normalised"
+            present = f"whose entries {list(now)} VecNormalize normalises" if now else "that nothing normalises"
+            wrapped = "in VecNormalize.load(<its statistics>, env)" if before else "without VecNormalize"
             warnings.warn(
-                f"The model has learned from observations whose entries {list(before)} VecNormalize normalised, and goes on "
-                f"with observations whose entries {list(now)} it normalises: wrap the environments as before, with "
-                "VecNormalize.load(<its statistics>, env), or train a new model.",
+                f"The model has learned from observations {then}, and goes on with observations {present}: wrap the "
+                f"environments as before, {wrapped}, or train a new model.",
                 stacklevel=3,
             )
         elif self._n_updates and (found := inputs_apart(self.normalised_scales, scales_of(self.env), now)):

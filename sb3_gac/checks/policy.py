@@ -61,17 +61,19 @@ def check_policy_kwargs(given: Mapping[str, Any]) -> None:
             check(name, given[name])
 
 
-def check_replay_buffer_kwargs(buffer_class: type, given: Mapping[str, Any]) -> None:
+def check_taken(argument: str, kind: type, given: Mapping[str, Any]) -> None:
     """
-    Check that a class of replay buffers takes all arguments.
+    Check that a class takes all arguments that are handed on to it.
 
-    :param buffer_class: class of the replay buffer
+    :param argument: argument of the algorithm that holds them, ``policy_kwargs`` or ``replay_buffer_kwargs``
+    :param kind: class of the policy or of the replay buffer; its first three arguments are the algorithm's to give
     :param given: name -> argument
     :raises TypeError: naming the first argument that the class does not take, and the one that may be meant
     """
-    known = constructor_parameters(buffer_class)
+    known = constructor_parameters(kind)
     for name in given:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
-            hint = f'is "{close[0]}" meant?' if close else f"it takes {', '.join(known[3:])}."
-            raise TypeError(f'replay_buffer_kwargs has "{name}", which is no argument of {buffer_class.__name__}: {hint}')
+            meant = f' Is "{close[0]}" meant?' if close else ""
+            takes = ", ".join(known[3:])
+            raise TypeError(f'{argument} has "{name}", which is no argument of {kind.__name__}: it takes {takes}.{meant}')

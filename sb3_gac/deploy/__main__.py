@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_gac.base.loading import load_model, model_file
+from sb3_gac.command_line import Parser
 from sb3_gac.deploy.export import WRITERS, export_learner
 from sb3_gac.deploy.statistics import STATISTICS, normalizer_of
 from sb3_gac.deploy.verification import ExportError
@@ -24,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     :param arguments: command-line arguments, ``None`` for those of the process
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser("sb3_gac.deploy", __doc__)
     parser.add_argument("model", type=Path, help="a run's directory, or a model's zip")
     parser.add_argument("out", type=Path, help=f"the file to write, with the suffix {' or '.join(WRITERS)}")
     parser.add_argument(

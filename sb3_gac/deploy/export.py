@@ -6,6 +6,7 @@ Nothing but the deployed policy goes into the file: no guider, no critics, and n
 
 import json
 import tempfile
+import warnings
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -274,15 +275,18 @@ def _write_onnx(module: DeployedModule, path: Path, metadata: str) -> None:
     # torch takes no number as a name, and confuses an entry with a parameter of the same name
     names = {f"{PASSING_NAME}{index}": name for index, name in enumerate([*inputs, *outputs])}
     passing = list(names)
-    th.onnx.export(
-        module,
-        _example(module),
-        str(path),
-        input_names=passing[: len(inputs)],
-        output_names=passing[len(inputs) :],
-        dynamic_axes={name: {0: "batch"} for name in passing},
-        dynamo=False,
-    )
+    with warnings.catch_warnings():
+        # Of initial states whose number of rows is fixed; here states are inputs, and the file's actions are compared
+        warnings.filterwarnings("ignore", "Exporting a model to ONNX with a batch_size other than 1", UserWarning)
+        th.onnx.export(
+            module,
+            _example(module),
+            str(path),
+            input_names=passing[: len(inputs)],
+            output_names=passing[len(inputs) :],
+            dynamic_axes={name: {0: "batch"} for name in passing},
+            dynamo=False,
+        )
     proto = onnx.load(str(path))
     _rename(proto.graph, names)
     onnx.helper.set_model_props(proto, {METADATA_KEY: metadata})

@@ -5,10 +5,10 @@ Print the registered environments with suites, shapes and installation; with ``-
     python -m sb3_gac.envs Go1 --speed --envs 1 16 128
 """
 
-import argparse
 import sys
 
-from sb3_gac.envs.table import Row, in_columns, rows, steps_per_second
+from sb3_gac.command_line import Parser
+from sb3_gac.envs.table import Row, by_suite, in_columns, rows, steps_per_second
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -17,9 +17,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     :param arguments: command-line arguments, ``None`` for those of the process
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_gac.envs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("sb3_gac.envs", __doc__)
     parser.add_argument("matching", nargs="?", default="", help="only ids that contain this, in small or capital letters")
     parser.add_argument("--speed", action="store_true", help="measure those that are installed")
     parser.add_argument(
@@ -42,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
     numbers = options.envs if options.speed else []
     header = ["id", *Row._fields[1:], *(f"steps/s, {number}" for number in numbers)]
     lines = [[*row, *(_speed(row, number, options.seconds) for number in numbers)] for row in found]
-    print(in_columns(header, lines))
+    print(by_suite(header, lines, bool(options.matching)) if sys.stdout.isatty() else in_columns(header, lines))
 
 
 def _speed(row: Row, n_envs: int, seconds: float) -> str:

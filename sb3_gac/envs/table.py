@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -96,6 +97,28 @@ def steps_per_second(env_id: str, n_envs: int, seconds: float = 1.0) -> float:
         return n_steps / (time.perf_counter() - started)
     finally:
         env.close()
+
+
+def by_suite(header: Sequence[str], lines: Sequence[Sequence[str]], whole: bool) -> str:
+    """
+    Lay out the table for a terminal: suite by suite, without the columns that are the same in all of a suite's rows.
+
+    :param header: names of the columns: those of :class:`Row`, and perhaps further ones
+    :param lines: rows, suite by suite
+    :param whole: whether suites that are not installed are shown with their environments, not in a line each
+    :return: for each suite a line with its name, and its environments in columns
+    """
+    suite, installed = Row._fields.index("suite"), Row._fields.index("installed")
+    parts = []
+    for (name, state), of_suite in groupby(lines, key=lambda line: (line[suite], line[installed])):
+        rows_of_suite = list(of_suite)
+        is_here = state == "yes"
+        heading = name if is_here else f"{name}: {len(rows_of_suite)} environments, not installed: {state}"
+        shorter = [[cell for at, cell in enumerate(line) if at not in (suite, installed)] for line in [header, *rows_of_suite]]
+        widths = [max(map(len, column)) for column in zip(*shorter, strict=True)]
+        table = "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in shorter)
+        parts.append(f"{heading}\n{table}\n" if is_here or whole else heading)
+    return "\n".join(parts)
 
 
 def in_columns(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

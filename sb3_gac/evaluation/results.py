@@ -122,9 +122,14 @@ def row(setting: Setting, policy: str, found: Outcome) -> list[str]:
         in_digits(found.std),
         _in_words(found.mean),
         NOTHING if found.share is None else f"{found.share:.0%}",
-        NOTHING if is_reference else f"{in_digits(found.difference.mean, '+')} {_in_words(found.difference, '+')}",
+        NOTHING if is_reference else _difference(found.difference),
         NOTHING if found.success is None else f"{found.success:.0%}",
     ]
+
+
+def _difference(found: Interval) -> str:
+    """A difference with its interval; the difference alone where a single episode has no interval."""
+    return in_digits(found.mean, "+") + (f" {_in_words(found, '+')}" if math.isfinite(found.low) else "")
 
 
 def in_digits(value: float, sign: str = "") -> str:

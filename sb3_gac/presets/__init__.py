@@ -26,7 +26,7 @@ from typing import Any
 import yaml
 from torch import nn, optim
 
-from sb3_gac.algorithms import ALGORITHMS, FAMILIES, algorithm_class, name_of
+from sb3_gac.algorithms import ALGORITHMS, FAMILIES, algorithm_class, meant, name_of
 from sb3_gac.envs.suites import shows_whole_state, task_named
 from sb3_gac.presets.noises import at_noise, defaults_of, merge
 
@@ -114,7 +114,7 @@ def read_preset(name: str) -> Preset:
     """
     path = DIRECTORY / f"{name}.yml"
     if not path.exists():
-        raise ValueError(f"preset must be one of {sorted(PRESETS)}, got {name!r}.")
+        raise ValueError(f"preset must be one of {sorted(PRESETS)}, got {name!r}.{meant(str(name), PRESETS)}")
     content = yaml.safe_load(path.read_text())
     extends = isinstance(content, Mapping) and "extends" in content
     _check(path.name, content, {"extends", *_PARTS}, set() if extends else {"run", "arguments"})

@@ -66,7 +66,11 @@ def check_unfinished(directory: Path) -> None:
     :raises ValueError: if the run is finished
     """
     if (directory / RESULTS).exists():
-        raise ValueError(f"--resume {directory}: this run is finished, its results are in {RESULTS}.")
+        raise ValueError(
+            f"--resume {directory}: this run is finished, its results are in {RESULTS}. Its checkpoints are gone: train anew "
+            "with more --steps; or go on in Python with an empty replay buffer: "
+            f'GAC.load("{directory / MODEL}", env=env).learn(...), with the class of its algorithm.'
+        )
 
 
 def _configuration(directory: Path) -> Mapping[str, Any]:
@@ -181,21 +185,27 @@ def summary(directory: Path, options: Namespace, entries: Sequence[str] = (PARTI
     name = algorithm_class(options.algorithm).__name__
     learner = f"{shown(results['learner'])} +- {shown(results['learner_std'])}"
     untrained = ", ".join(f"{name} {shown(mean)} +- {shown(std)}" for name, (mean, std) in results["untrained"].items())
-    observation = ", ".join(f'"{key}": {"observation" if len(entries) == 1 else f"observation[{key!r}]"}' for key in entries)
-    statistics = directory / STATISTICS
-    normalised = (
-        f"""
-The observation is to be normalised by {statistics}, as in training; a file of `sb3-gac export --vec-normalize` does it."""
-        if statistics.exists()
-        else ""
-    )
     return f"""
 Trained {name} on {in_words(options)} for {results["steps"]:,} steps in {results["minutes"]:.1f} minutes.
 Learner, seeing {" and ".join(f"`{key}`" for key in entries)} alone: return {learner} over {options.episodes} episodes.
 Without training, same seeds: {untrained}.
 Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:
-    from sb3_gac import {name}; model = {name}.load("{directory / MODEL}")
-    action, _ = model.predict({{{observation}}}, deterministic=True){normalised}"""
+{_how_to_use(directory, name, entries)}"""
+
+
+def _how_to_use(directory: Path, name: str, entries: Sequence[str]) -> str:
+    """Lines of Python that act with the learner, on observations as the environment returns them."""
+    shown_to_it = ", ".join(f'"{key}": {"observation" if len(entries) == 1 else f"observation[{key!r}]"}' for key in entries)
+    lines = [f'from sb3_gac import {name}; model = {name}.load("{directory / MODEL}")']
+    observation, statistics = f"{{{shown_to_it}}}", directory / STATISTICS
+    if statistics.exists():
+        lines += [
+            "import pickle; from sb3_gac import DeploymentNormalizer",
+            f'statistics = pickle.load(open("{statistics}", "rb"))',
+            f"normalize = DeploymentNormalizer.from_vec_normalize(statistics, {list(entries)})",
+        ]
+        observation = f"normalize({observation})"
+    return "\n".join(f"    {line}" for line in [*lines, f"action, _ = model.predict({observation}, deterministic=True)"])
 
 
 def in_words(options: Namespace) -> str:

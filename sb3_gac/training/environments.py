@@ -11,10 +11,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import NameNotFound, NamespaceNotFound
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_gac.algorithms import import_path
+from sb3_gac.checks.values import as_sentence
 from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.envs import PARTIAL, History, make_vec
 from sb3_gac.envs.suites import suite_of
@@ -73,6 +75,27 @@ def in_wrappers(env: gym.Env, wrappers: Sequence[Mapping[str, Mapping[str, Any]]
     return env
 
 
+def check_split(env_id: str, space: spaces.Space) -> None:
+    """
+    Check that the observations of an environment of one's own are split into entries, before an algorithm reads them.
+
+    :param env_id: id of the environment, or ``module:name``, for the message
+    :param space: observation space of the environment
+    :raises ValueError: if the space is no Dict with the entry ``partial``; the message says how to make one
+    """
+    if not isinstance(space, spaces.Dict):
+        found, wrapper = f"are {space}", "SplitObservation"
+    elif PARTIAL not in space.spaces:
+        found, wrapper = f"have the entries {list(space.spaces)}", "SplitDictObservation"
+    else:
+        return
+    raise ValueError(
+        f"--env: the observations of {env_id} {found}, and must be a Dict with the entries partial, for the learner, and "
+        "privileged. Give --env my_module:make_env, a function of yours that returns "
+        f"sb3_gac.envs.{wrapper}(env, partial=[...], privileged=[...]); docs/environments.md shows how."
+    )
+
+
 def creator_of(env_id: str) -> Callable[..., gym.Env]:
     """
     Find what makes an environment. Where a module has a class or function of the name under which it registers an environment,
@@ -81,13 +104,23 @@ def creator_of(env_id: str) -> Callable[..., gym.Env]:
     :param env_id: name of an environment, as :func:`make_wrapped` describes
     :return: function that makes the environment from its keyword arguments
     :raises ModuleNotFoundError: if there is no such module
+    :raises gymnasium.error.NameNotFound: if no environment has that name
     """
     module, _, name = env_id.rpartition(":")
     found = getattr(import_module(module), name, None) if module else None
     if callable(found) and name not in gym.registry:
         creator: Callable[..., gym.Env] = found
         return creator
-    return partial(gym.make, env_id)
+    return partial(_make_registered, env_id)
+
+
+def _make_registered(env_id: str, **kwargs: Any) -> gym.Env:
+    try:
+        return gym.make(env_id, **kwargs)
+    except (NameNotFound, NamespaceNotFound) as error:
+        if ":" in env_id:
+            raise
+        raise type(error)(f"{as_sentence(error)} An id that a module of yours registers is my_module:{env_id}.") from error
 
 
 def with_history(env: gym.Env, length: int) -> gym.Env:

@@ -36,9 +36,9 @@ from sb3_gac.training.directory import (
     write_at_once,
     write_configuration,
 )
-from sb3_gac.training.environments import entries_of_floats, find_modules_here, make_envs, normalized
+from sb3_gac.training.environments import check_split, entries_of_floats, find_modules_here, make_envs, normalized
 from sb3_gac.training.evaluation import EVAL_SEED, DeployedView, EndlessEpisodesWarning, evaluate, untrained_policies
-from sb3_gac.training.options import EPISODES_ON_THE_WAY, TEACHER, algorithm_arguments
+from sb3_gac.training.options import EPISODES_ON_THE_WAY, TEACHER, algorithm_arguments, check_steps
 from sb3_gac.training.progress import Progress
 
 EVALUATIONS = 10
@@ -73,6 +73,8 @@ def prepare(options: Namespace) -> Job:
     _check_log(options)
     set_random_seed(options.seed)
     env, eval_env = open_environments(options)
+    if options.task is None and "role_keys" not in options.overrides:
+        check_split(options.env_id, env.observation_space)
     with ExitStack() as held:
         begin = _begun if options.resume is None else _taken_up
         directory, model, goes_on = begin(options, env, held)
@@ -93,6 +95,7 @@ def _begun(options: Namespace, env: VecEnv, held: ExitStack) -> tuple[Path, Any,
     """Directory and model of a new run, which the context keeps for this process."""
     directory = new_directory(options)
     model = _new(options, directory, env)
+    check_steps(type(model).__name__, options.steps, getattr(model, "learning_starts", 0))
     write_configuration(directory, options, model)
     held.enter_context(locked(directory, CONFIGURATION))
     return directory, model, False

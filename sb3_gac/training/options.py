@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
 from sb3_gac.base.loading import model_file
 from sb3_gac.checks.arguments import constructor_parameters
+from sb3_gac.command_line import Parser, mapping, one_of, positive
 from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.envs.suites import SUITES, Suite, env_id_of, registered_id, suite_of, task_of
 from sb3_gac.presets import PRESETS, instantiate, merge, preset, read_preset
@@ -50,9 +50,7 @@ def make_parser(description: str | None = None) -> argparse.ArgumentParser:
     :param description: description of the program, for its help
     :return: parser of the command line, which sets options that are not given to ``None``
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_gac.train", description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("sb3_gac.train", description)
     _add_environment(parser.add_argument_group("what to train on"))
     _add_training(parser.add_argument_group("how to train"))
     _add_results(parser.add_argument_group("what is left of it"))
@@ -63,7 +61,7 @@ def _add_environment(group: Any) -> None:
     tasks = sorted(task_of(env_id) for suite in SUITES.values() if suite.sensor_noise for env_id in suite.environments)
     group.add_argument(
         "--task",
-        choices=tasks,
+        type=one_of(tasks, "sb3-gac envs lists the tasks. Every other environment goes by --env."),
         metavar="TASK",
         help=f"registered task that takes --noise, one of {', '.join(tasks)}; other registered tasks go by --env, and "
         f"sb3-gac envs lists them (default: {DEFAULTS['task']})",
@@ -106,7 +104,7 @@ def _add_environment(group: Any) -> None:
 def _add_training(group: Any) -> None:
     group.add_argument(
         "--algorithm",
-        choices=list(ALGORITHMS),
+        type=one_of(list(ALGORITHMS)),
         metavar="NAME",
         help=f"one of {', '.join(ALGORITHMS)} (default: {DEFAULTS['algorithm']})",
     )
@@ -120,14 +118,15 @@ def _add_training(group: Any) -> None:
     group.add_argument("--envs", type=positive, help="environments side by side (default: as many as the preset is for)")
     group.add_argument(
         "--preset",
-        choices=sorted(PRESETS),
-        help="arguments of the algorithm (default: those for the task's suite, or small)",
+        type=one_of(sorted(PRESETS)),
+        metavar="NAME",
+        help=f"arguments of the algorithm: {', '.join(sorted(PRESETS))} (default: those for the task's suite, or small)",
     )
     group.add_argument(
         "--overrides",
         type=mapping,
         metavar="YAML",
-        help='changes to the preset, such as "{gamma: 0.95, learning_rate: 1.0e-3}"; YAML reads 1e-3 as text (default: none)',
+        help='changes to the preset, such as "{gamma: 0.95, learning_rate: 1e-3}" (default: none)',
     )
     group.add_argument(
         "--normalize",
@@ -152,51 +151,15 @@ def _add_results(group: Any) -> None:
         help=f"of the last evaluation (default: {DEFAULTS['episodes']}); those on the way have {EPISODES_ON_THE_WAY}",
     )
     group.add_argument(
-        "--tensorboard", action="store_true", default=None, help="log for TensorBoard in the run's directory (default: no)"
+        "--tensorboard",
+        action="store_true",
+        default=None,
+        help="log for TensorBoard in the run's directory, which needs pip install tensorboard (default: no)",
     )
     group.add_argument("--runs", type=Path, help=f"where runs have their directories (default: {DEFAULTS['runs']})")
     group.add_argument(
         "--resume", type=Path, metavar="DIRECTORY", help="of a run that was stopped, to go on with it and its options"
     )
-
-
-def positive(text: str) -> int:
-    """
-    :param text: value on the command line
-    :return: number that it stands for
-    :raises argparse.ArgumentTypeError: if it is no integer, or below 1
-    """
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be an integer of at least 1, got {text}")
-    return value
-
-
-def from_yaml(text: str) -> Any:
-    """
-    :param text: value on the command line
-    :return: content of the YAML
-    :raises argparse.ArgumentTypeError: if the text is no YAML
-    """
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no YAML: {error}") from None
-
-
-def mapping(text: str) -> dict[str, Any]:
-    """
-    :param text: value on the command line
-    :return: mapping that it stands for
-    :raises argparse.ArgumentTypeError: if the text is no mapping in YAML
-    """
-    found = from_yaml(text)
-    if not isinstance(found, Mapping):
-        raise argparse.ArgumentTypeError(f'must be a mapping, such as "{{key: 0.1}}", got {text!r}')
-    return dict(found)
 
 
 def given_options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> dict[str, Any]:
@@ -349,6 +312,22 @@ def algorithm_arguments(options: Namespace) -> dict[str, Any]:
     noise = float(np.mean(options.noise or 0.0))
     of_preset = preset(options.preset, algorithm=kind, task=options.task, noise=noise)
     return instantiate(merge(of_preset, merge(own, options.overrides)))
+
+
+def check_steps(name: str, steps: int, learning_starts: int) -> None:
+    """
+    Refuse a run that would end before the first gradient step: its results would be those of a policy without training.
+
+    :param name: name of the algorithm
+    :param steps: number of environment steps of the run
+    :param learning_starts: number of environment steps after which gradient steps begin
+    :raises ValueError: if the run has no step after these
+    """
+    if steps <= learning_starts:
+        raise ValueError(
+            f"--steps: {name} makes its first gradient step after {learning_starts:,} steps (learning_starts), so in "
+            f'{steps:,} steps nothing is learned: give more --steps, or --overrides "{{learning_starts: ...}}".'
+        )
 
 
 def name_of_run(options: Namespace) -> str:

@@ -98,7 +98,9 @@ UNKNOWN = {
     "max_grad_nrm": 'Is "max_grad_norm" meant',
     "n_critics": "one of policy_kwargs",
     "n_envs": "follows from env",
-    "strict_deployment": "on the model itself",
+    "strict_deployment": "Set it on the model itself",
+    "use_sde": "no state-dependent exploration .* Leave it out",
+    "colour": "It takes policy, env, .*learning_rate",
 }
 
 
@@ -111,6 +113,15 @@ def test_what_is_no_argument_is_refused_by_name(cls):
             TypeError, match=rf'^{cls.__name__}\(\) got "{name}", which is no argument of {cls.__name__}\. .*{hint}'
         ):
             small_model(cls=cls, **{name: 3})
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("log_std_init", 'it takes net_arch, .*[.] Is "log_std_bounds" meant[?]'), ("colour", "it takes net_arch, activation_fn, ")],
+)
+def test_what_is_no_argument_of_the_policy_is_refused_as_one_of_policy_kwargs(name, hint):
+    with pytest.raises(TypeError, match=f'^policy_kwargs has "{name}", which is no argument of .*Policy: {hint}'):
+        small_model(policy_kwargs={name: -3})
 
 
 # --- a subclass with arguments of its own -------------------------------------------------------------------------------

@@ -213,7 +213,8 @@ UNKNOWN = {
     "net_arch": "one of policy_kwargs",
     "n_critics": "one of policy_kwargs",
     "n_envs": "follows from env",
-    "colour": "on the model itself",
+    "use_sde": "no state-dependent exploration .* Leave it out",
+    "colour": "It takes policy, .*learning_rate",
 }
 
 

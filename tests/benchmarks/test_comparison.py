@@ -1,5 +1,6 @@
 """``python -m sb3_gac.compare``: options become a suite, runs are made once, and the page says what follows."""
 
+import re
 import shlex
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from gymnasium import spaces
 from benchmarks import comparison, comparison_page, launch
 from benchmarks.comparison import command, main, parse_arguments, suite_of_options
 from benchmarks.config import first_gradient_step, reads_partial_alone
+from benchmarks.headroom import worth
 from benchmarks.run import run
 from benchmarks.suite import RunSpec, cells_of, read_suite
 
@@ -137,6 +139,22 @@ def test_a_comparison_from_its_command_to_its_page(engine, monkeypatch, tmp_path
     assert engine.made == 5
 
 
+@pytest.mark.parametrize(("random_return", "bold"), [(5.0, ["SAC-asym"]), (50.0, [])])
+def test_the_best_row_is_bold_where_something_was_learned(random_return, bold):
+    """And no row is, if random actions return more than all that was trained."""
+    returns = {"sac-full": 20.0, "sac-asym": 11.0, "gac": 10.0}
+    rows = [
+        {"algorithm": name, "seed": seed, "timesteps": step, "learner": value + 0.1 * seed}
+        for name, value in returns.items()
+        for seed in range(3)
+        for step in range(1, 5)
+    ]
+    untrained = {"random actions": np.linspace(random_return - 0.1, random_return + 0.1, 5)}
+    found = worth(pd.DataFrame(rows), untrained, {"sac-asym", "gac"})
+    marked = re.findall(r"<tr class=best><td[^>]*>([^<]*)", comparison_page._ends_table(found))
+    assert marked == bold
+
+
 @pytest.mark.parametrize(("seeds", "bands"), [(2, 0), (3, 2)])
 def test_the_axis_fits_late_returns_and_bands_need_three_seeds(seeds, bands):
     rows = [
@@ -146,6 +164,9 @@ def test_the_axis_fits_late_returns_and_bands_need_three_seeds(seeds, bands):
         for step in range(1, 13)
     ]
     figure = comparison_page._curves(pd.DataFrame(rows), "random actions", -5.0)
+    floor = figure.data[-1]
+    assert (floor.name, list(floor.x), list(floor.y)) == ("random actions, without training", [1, 12], [-5.0, -5.0])
+    assert not figure.layout.annotations, "which would hide the ends of curves"
     assert len([line for line in figure.data if line.fill]) == bands
     margin = 0.08 * (12 + seeds - 1 + 5)
     assert figure.layout.yaxis.range == pytest.approx((-5 - margin, 12 + seeds - 1 + margin))
@@ -268,6 +289,16 @@ def test_runs_without_a_gradient_step_are_refused(steps, overrides, engine, monk
     assert first_gradient_step(replace(specs[0], algorithm="sb3-sac", preset="sb3", overrides={})) == 2_000
 
 
+@pytest.mark.parametrize(("name", "wrapper"), [("make_foreign", "SplitObservation"), ("make_unsplit", "SplitDictObservation")])
+def test_an_environment_whose_observations_are_not_split_is_refused_without_the_words_of_a_suite(
+    name, wrapper, engine, monkeypatch
+):
+    env_id = f"tests.training.test_options:{name}"
+    with pytest.raises(SystemExit, match=rf"^--env: the observations of {env_id} .* returns sb3_gac.envs.{wrapper}\("):
+        _compare(monkeypatch, "--env", env_id)
+    assert engine.made == 0
+
+
 def test_what_can_be_deployed_is_decided_by_what_the_deployed_policy_reads():
     names = ("sac-full", "sac-asym", "gac", "sac", "sb3-sac", "gpo-clip", "rma", "tgrl", "dreamer-v3")
     spec = replace(_specs("--env", "m:make")[0], overrides={"role_keys": None}, environment=None, task="Hopper")
@@ -285,7 +316,7 @@ def test_what_can_be_deployed_is_decided_by_what_the_deployed_policy_reads():
         (["--seeds", "0"], "must be an integer of at least 1"),
         (["--env-kwargs", "noise"], "must be a mapping"),
         (["--env-kwargs", "{noise: ["], "is no YAML"),
-        (["--algorithms", "ppo"], "invalid choice: 'ppo'"),
+        (["--algorithms", "ppo"], 'there is no "ppo"'),
     ],
 )
 def test_bad_options_are_named(capsys, arguments, message):

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+import warnings
 from contextlib import nullcontext
 from functools import partial
 
@@ -488,3 +489,9 @@ def test_statistics_of_another_training_are_refused(tmp_path):
         export([str(tmp_path / "model.zip"), str(tmp_path / "learner.pt"), "--vec-normalize", str(tmp_path / "wrong.pkl")])
     assert not (tmp_path / "learner.pt").exists()
     export_learner(model, tmp_path / "learner.pt")
+
+
+def test_a_memory_is_exported_without_torchs_warning_of_other_batch_sizes(tmp_path):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "Exporting a model to ONNX with a batch_size other than 1")
+        export_learner(WITH_MEMORY["recurrent"](), tmp_path / "learner.onnx", verify_on=4)

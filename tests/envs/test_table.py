@@ -66,5 +66,24 @@ def test_steps_of_all_environments_are_counted(monkeypatch):
     assert steps_per_second("sb3_gac/Pendulum-v1", 4, seconds=40.0) == pytest.approx(4 * 39 / 41)
 
 
+def test_a_terminal_of_80_columns_has_room_for_what_is_installed_and_a_line_for_each_other_suite(monkeypatch, capsys):
+    monkeypatch.setattr(suites, "find_spec", lambda module: None if module in ("popgym", "brax") else module)
+    monkeypatch.setattr("sb3_gac.envs.table._shapes", lambda *of: ("3x64x64", "12", "23"))
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    main([])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    number = len(suites.SUITES["popgym"].environments)
+    assert f'popgym: {number} environments, not installed: pip install -e ".[popgym]"' in lines
+    assert not any("sb3_gac/popgym" in line for line in lines)
+    assert "mujoco" in lines
+    assert any(line.startswith("sb3_gac/Ant-v5 ") for line in lines)
+    main(["brax-ant"])
+    heading, header, row, _ = capsys.readouterr().out.splitlines()
+    assert heading == 'brax: 1 environments, not installed: pip install -e ".[brax]"'
+    assert header.split() == ["id", "partial", "privileged", "actions"]
+    assert row.split() == ["sb3_gac/brax-Ant-v0", "3x64x64", "12", "23"]
+
+
 def test_columns_are_as_wide_as_their_widest_cell():
     assert in_columns(["a", "number"], [["long", "1"]]) == "| a    | number |\n| ---- | ------ |\n| long | 1      |"

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gac import GAC, AsymmetricSAC, export_learner
 from sb3_gac.algorithms import ALGORITHMS, algorithm_class
-from sb3_gac.base.loading import load_model
+from sb3_gac.base.loading import load_model, model_file
 from sb3_gac.evaluate import main, parse_arguments
 from sb3_gac.evaluation.episodes import Episode, run_episodes
 from sb3_gac.evaluation.figure import draw
@@ -230,6 +230,17 @@ def test_exported_files_take_images_as_the_environment_shows_them(suffix, tmp_pa
     np.testing.assert_allclose(actions, model.predict({"partial": images}, deterministic=True)[0], atol=1e-5)
 
 
+def test_a_directory_without_a_model_says_what_is_in_it_and_what_to_do(tmp_path):
+    (tmp_path / "config.yaml").touch()
+    with pytest.raises(FileNotFoundError, match=rf"has no model.zip: .* sb3-gac train --resume {tmp_path} goes on with it"):
+        model_file(tmp_path)
+    for name in ("last.zip", "best.zip"):
+        (tmp_path / name).touch()
+    others = f"{tmp_path}/best.zip, {tmp_path}/last.zip"
+    with pytest.raises(FileNotFoundError, match=rf"has no model.zip, but other models: give one of {others}\.$"):
+        model_file(tmp_path)
+
+
 def test_what_is_wrong_is_said_before_anything_is_run(gac, tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_gac.evaluate.run_episodes", None)
     asymmetric = tmp_path / "asymmetric.zip"
@@ -389,7 +400,7 @@ def test_a_row_says_what_can_not_be_said():
         "-",
         "-",
         "-",
-        "-234.6 -",
+        "-234.6",
         "-",
     ]
     reference = outcome(_episodes(4, 6, success=True), _episodes(4, 6))

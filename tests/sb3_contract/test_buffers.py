@@ -59,7 +59,7 @@ def test_unknown_buffer_arguments_are_refused(algorithm):
 
 def test_the_buffers_argument_that_may_be_meant_is_named():
     with pytest.raises(
-        TypeError, match=r'has "storage_dtyp", which is no argument of CompactDict.*: is "storage_dtype" meant'
+        TypeError, match=r'has "storage_dtyp", which is no argument of CompactDict.*: it .* Is "storage_dtype" meant'
     ):
         make("gac", pendulum(), replay_buffer_kwargs={"storage_dtyp": "float16"})
 

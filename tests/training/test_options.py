@@ -36,6 +36,11 @@ def make_geared():
     return Sampled(spaces.Dict(**shown, gear=spaces.Discrete(3)))
 
 
+def make_unsplit():
+    """One whose entries are none of ours."""
+    return Sampled(spaces.Dict(gps=spaces.Box(-1, 1, (2,), np.float32), wind=spaces.Box(-1, 1, (2,), np.float32)))
+
+
 def make_foreign():
     """One whose observations are none of ours."""
     return gym.make("CartPole-v1")
@@ -75,7 +80,7 @@ def test_help_has_the_defaults_and_needs_no_more_than_80_columns(monkeypatch):
         (["--env", "sb3_gac:sb3_gac/TigerDoor-v0", "--noise", "0.1"], "--noise: sb3_gac/TigerDoor-v0 has no such argument"),
         (["--teacher", "model.zip"], "--teacher: GAC has none"),
         (["--steps", "0"], "--steps: must be an integer of at least 1, got 0"),
-        (["--steps", "1e4"], "--steps: must be an integer of at least 1, got 1e4"),
+        (["--steps", "1e-4"], "--steps: must be an integer of at least 1, got 1e-4"),
         (["--env-kwargs", "3"], "must be a mapping"),
         (["--overrides", "{"], "is no YAML"),
     ],
@@ -191,7 +196,7 @@ def test_one_of_this_packages_environments_is_a_task_by_its_id():
     ("env_id", "message"),
     [
         ("no_such_module:Env-v0", "no_such_module"),
-        ("NoSuch-v0", "NoSuch"),
+        ("NoSuch-v0", "NoSuch.* An id that a module of yours registers is my_module:NoSuch-v0"),
         ("tests.training.test_options:Nothing-v0", "Nothing"),
     ],
 )
@@ -201,10 +206,16 @@ def test_an_environment_that_there_is_not_is_named(env_id, message, tmp_path):
 
 
 def test_nothing_is_written_for_an_environment_with_other_observations(tmp_path):
-    arguments = ["--env", "tests.training.test_options:make_foreign", "--runs", str(tmp_path)]
-    with pytest.raises((ValueError, TypeError), match=r"(?i)dict"):
-        prepare(parse_arguments(arguments))
+    module = "tests.training.test_options"
+    for name, message in {
+        "make_foreign": r"foreign are Box\(.* must be a Dict with .* a function of yours .* sb3_gac.envs.SplitObservation\(",
+        "make_unsplit": r"unsplit have the entries \['gps', 'wind'\], .* returns sb3_gac.envs.SplitDictObservation\(",
+    }.items():
+        with pytest.raises(ValueError, match=rf"^--env: the observations of {module}:make_{message}"):
+            prepare(parse_arguments(["--env", f"{module}:{name}", "--runs", str(tmp_path)]))
     assert list(tmp_path.iterdir()) == []
+    by_name = ["--overrides", "{role_keys: {learner: [gps], guider: [gps, wind], critic: [wind]}}", "--runs", str(tmp_path)]
+    assert prepare(parse_arguments(["--env", f"{module}:make_unsplit", *by_name])).model.policy.deployed_entries == ("gps",)
 
 
 def test_runs_of_the_same_second_have_directories_of_their_own(tmp_path, monkeypatch):

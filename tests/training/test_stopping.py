@@ -88,6 +88,7 @@ def test_while_other_libraries_are_imported(module, tmp_path):
 def test_while_results_are_written(tmp_path):
     interrupts = "import sb3_gac.training.job as job\njob.draw_learning_curve = interrupt\n"
     options = ["--env", "tests.training.test_options:make_own", "--steps", "40", "--episodes", "1"]
+    options += ["--overrides", "{learning_starts: 20}"]
     ended = _interrupted(tmp_path, interrupts, *options)
     assert ended.returncode == 130
     (directory,) = (tmp_path / "runs").iterdir()

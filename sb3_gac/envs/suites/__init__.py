@@ -82,6 +82,8 @@ class Suite(NamedTuple):
 
 
 _NAMESPACE = "sb3_gac/"
+#: Least likeness of names that a message calls near
+_NEAR = (False, 0.7)
 #: Arguments of an environment that are for this package, not for gymnasium
 _OWN = ("vec_entry_point", "shapes", "whole_state")
 #: Arguments of environments that are stepped one at a time -> value that changes nothing
@@ -188,10 +190,12 @@ def task_named(name: str) -> str:
     plain = without_module(name).removeprefix(_NAMESPACE)
     named = {**{env_id.removeprefix(_NAMESPACE): task for task, env_id in ids.items()}, **{task: task for task in ids}}
     if plain not in named:
-        nearest = sorted(ids, key=lambda task: _likeness(task.casefold(), plain.casefold()), reverse=True)[:3]
+        likeness = {task: _likeness(task.casefold(), plain.casefold()) for task in ids}
+        near = [task for task in sorted(ids, key=likeness.__getitem__, reverse=True) if likeness[task] >= _NEAR][:3]
+        nearest = f"; the nearest are {near}" if near else ""
         raise ValueError(
-            f"task must be one of the registered sb3_gac/<task>-v<version>, which python -m sb3_gac.envs lists; the nearest "
-            f"are {nearest}, got {name!r}."
+            f"task must be one of the registered sb3_gac/<task>-v<version>, which python -m sb3_gac.envs lists{nearest}, got "
+            f"{name!r}. For an environment of your own, leave task out."
         )
     return named[plain]
 
