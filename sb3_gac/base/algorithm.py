@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_gac.base.acting import BehaviourState
 from sb3_gac.base.arguments import ConstructorArguments, present_names
-from sb3_gac.base.changing import ChangingArguments, arguments_of
+from sb3_gac.base.changing import ChangingArguments
 from sb3_gac.base.compiling import AUTO, Compilation
 from sb3_gac.base.faults import FaultTolerance
 from sb3_gac.base.frozen import FrozenPolicy, load_frozen_policy
@@ -120,7 +120,7 @@ class AsymmetricAlgorithm(
         self.frozen = {}
         if self.env is not None:  # a model without environments only acts, which takes no teacher
             self._load_frozen(needed=False)
-        self._in_force = arguments_of(self)
+        self.keep_in_force()
 
     def _prepare_data(self) -> dict[str, Any]:
         """
@@ -305,17 +305,15 @@ class AsymmetricAlgorithm(
         self.make_schedules()
         if "learning_rate" in changed:
             self._setup_lr_schedule()
+        if replaced := changed.intersection(self.frozen_arguments):
+            self.frozen = {name: teacher for name, teacher in self.frozen.items() if name not in replaced}
+            self._load_frozen(needed=True)
         if "lr_scales" in changed:
             self.policy.scale_learning_rates(self._all_policy_kwargs()["lr_scales"])
         if "stats_window_size" in changed:
             for buffer in ("ep_info_buffer", "ep_success_buffer"):
                 if getattr(self, buffer) is not None:
                     setattr(self, buffer, deque(getattr(self, buffer), maxlen=self._stats_window_size))
-        replaced = changed.intersection(self.frozen_arguments)
-        for name in replaced:
-            self.frozen.pop(name, None)
-        if replaced:
-            self._load_frozen(needed=True)
 
     def _excluded_save_params(self) -> list[str]:
         coefficients = [f"{name}_dual" for name in self.coefficients]

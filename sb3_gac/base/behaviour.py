@@ -29,8 +29,8 @@ class Behaviour:
         policy has a fixed part of the environments
     :param frozen: names of frozen policies, which may act as well
     :param n_envs: number of environments
-    :raises ValueError: if a name is no policy's, if shares are not from 0 to 1, or if they sum up to less than 1 and no policy
-        is left for the remainder
+    :raises ValueError: if a name is no policy's, or if, at any of ``MOMENTS``, shares are not from 0 to 1, or sum up to less
+        than 1 and no policy is left for the remainder
     """
 
     def __init__(
@@ -45,7 +45,8 @@ class Behaviour:
         self.n_envs = n_envs
         for role in (self.default, *self.shares):
             check_choice("behaviour: a policy", role, (*roles.policies, *frozen))
-        self.shares_at(1.0)
+        for moment in MOMENTS:
+            self.shares_at(moment)
 
     def check_parts(self) -> None:
         """
@@ -85,10 +86,11 @@ class Behaviour:
         :raises ValueError: if a share is not from 0 to 1, or their sum above 1, or below 1 without a policy for the remainder
         """
         now = {role: float(share(progress_remaining) if callable(share) else share) for role, share in self.shares.items()}
+        when = f"{now} where {progress_remaining:.3g} of training remains"
         if not (all(0 <= share <= 1 for share in now.values()) and sum(now.values()) <= 1 + 1e-9):
-            raise ValueError(f"behaviour must be shares from 0 to 1 that sum up to 1 at most, got {now}.")
+            raise ValueError(f"behaviour must be shares from 0 to 1 that sum up to 1 at most, got {when}.")
         if self.shares and self.remainder is None and sum(now.values()) < 1 - 1e-9:
-            raise ValueError(f"behaviour must be shares that sum up to 1, as no policy is left for the remainder; got {now}.")
+            raise ValueError(f"behaviour must be shares that sum up to 1, as no policy is left for the remainder; got {when}.")
         return now
 
     def choose(self, acting: Sequence[str], episode_start: np.ndarray, progress_remaining: float) -> list[str]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +16,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_gac.checks.arguments import constructor_arguments
+from sb3_gac.checks.values import described
 
 #: Argument -> what to do with it where guider and learner are apart
 _ADVICE = {
@@ -29,6 +31,26 @@ _ADVICE = {
     "see more": "let it see more (a history, a memory)",
 }
 _WATCHED = ("train/kl", "train/target_kl", "train/kl_coef", "train/kl_coef_on_bound", "train/learner_mean_abs")
+#: File under ``log_path``, beside SB3's "evaluations.npz"
+GUIDER_EVALUATIONS = "guider_evaluations.npz"
+
+
+def _rows_until(step: int, path: Path) -> dict[str, np.ndarray]:
+    """
+    :param step: environment step
+    :param path: file of evaluations, one row of each array for each of them
+    :return: name -> the rows up to that step; empty without such rows, with a warning about a file that can't be read
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            columns = dict(stored)
+        kept = columns["timesteps"] <= step
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, EOFError, KeyError, BadZipFile) as error:
+        warnings.warn(f"{path} can't be read, and evaluations start anew there: {described(error)}", stacklevel=2)
+        return {}
+    return {name: column[kept] for name, column in columns.items() if len(column) == len(kept)} if kept.any() else {}
 
 
 @contextmanager
@@ -50,9 +72,13 @@ class SeededEvalCallback(EvalCallback):
     With ``deterministic=False`` actions are sampled, by random numbers that are the same at every evaluation as well. The
     random numbers of training stay what they were.
 
+    A new callback goes on with the files under ``log_path`` where ``learn`` goes on with a training, after ``resume`` for
+    example: evaluations up to the present step stay, with the best of them, and later ones are dropped.
+
     :param eval_env: environment for evaluation
     :param eval_seed: seed that the evaluation environments get before every evaluation
     :param kwargs: further arguments of SB3's ``EvalCallback``, such as ``eval_freq`` and ``n_eval_episodes``
+    :raises ValueError: when ``learn`` goes on, if the evaluations in the files have another number of episodes
     """
 
     def __init__(self, eval_env: gym.Env | VecEnv, eval_seed: int = 10_000, **kwargs: Any):
@@ -65,6 +91,27 @@ class SeededEvalCallback(EvalCallback):
         # The model wraps its own environments in this way, and SB3 copies statistics between environments wrapped alike
         self.eval_env = BaseAlgorithm._wrap_env(self.eval_env)
         super()._init_callback()
+        if self.log_path is not None and self.model.num_timesteps > 0 and not self.evaluations_timesteps:
+            self._go_on_from_files()
+
+    def _go_on_from_files(self) -> None:
+        """Take over the evaluations up to the present step, because the files are written anew at each evaluation."""
+        stored = _rows_until(self.model.num_timesteps, Path(f"{self.log_path}.npz"))
+        if not stored:
+            return
+        steps, returns = stored["timesteps"], stored["results"]
+        if returns.shape[1] != self.n_eval_episodes:
+            raise ValueError(
+                f"{self.log_path}.npz has evaluations of {returns.shape[1]} episodes, but n_eval_episodes is "
+                f"{self.n_eval_episodes}: give the former number, or another log_path."
+            )
+        self.evaluations_timesteps, self.evaluations_results = steps.tolist(), returns.tolist()
+        self.evaluations_length = stored["ep_lengths"].tolist()
+        self.evaluations_successes = stored["successes"].tolist() if "successes" in stored else []
+        means = returns.mean(axis=1).tolist()
+        self.history = [{"timesteps": step, "learner": mean} for step, mean in zip(steps.tolist(), means, strict=True)]
+        self.best_mean_reward, self.last_mean_reward = max(means), means[-1]
+        self.n_calls = self.model.num_timesteps // self.training_env.num_envs  # as if evaluations had never stopped
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
@@ -151,6 +198,15 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
             )
         super()._init_callback()
 
+    def _go_on_from_files(self) -> None:
+        super()._go_on_from_files()
+        assert self._directory is not None
+        stored = _rows_until(self.model.num_timesteps, self._directory / GUIDER_EVALUATIONS)
+        columns = {name: column.tolist() for name, column in stored.items()}
+        rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+        seen = {row["timesteps"]: {name: value for name, value in row.items() if not np.isnan(value)} for row in rows}
+        self.history = [row | seen.get(row["timesteps"], {}) for row in self.history]
+
     def _on_rollout_start(self) -> None:
         """Collect the metrics that the last gradient steps logged, because the logger forgets them at every dump."""
         logged = self.logger.name_to_value
@@ -183,7 +239,7 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
         self.history[-1].update(guider | {name.removeprefix("train/"): value for name, value in self._watched.items()})
         if self._directory is not None:
             np.savez(
-                self._directory / "guider_evaluations.npz",
+                self._directory / GUIDER_EVALUATIONS,
                 **{name: np.array([entry.get(name, np.nan) for entry in self.history]) for name in self.history[-1]},  # type: ignore[arg-type]
             )
         self._warn_if_not_following(self._guider_returns, returns)

@@ -1,7 +1,7 @@
 """Arguments that are set on a model after it was made: they take effect, or are refused by name."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, ClassVar
 
@@ -41,8 +41,24 @@ class ChangingArguments(BaseAlgorithm):
         now = arguments_of(self)
         changed = {name: value for name, value in now.items() if differ(value, self._in_force.get(name))}
         if changed:
-            set_arguments(self, self._in_force)
+            set_arguments(self, {name: copied(self._in_force.get(name)) for name in changed})
             self._change_arguments(changed, "Setting an argument")
+
+    def keep_in_force(self) -> None:
+        """Take note of the arguments that training goes by, and of what is in their dicts and lists."""
+        self._in_force = {name: copied(value) for name, value in arguments_of(self).items()}
+
+    def save(self, path: Any, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
+        """
+        See SB3's ``save``; arguments that were set on the model take effect before.
+
+        :param path: path of the model's file, or an open file
+        :param exclude: names of attributes that are left out, besides those that always are
+        :param include: names of attributes that are saved although they would be left out
+        :raises ValueError: naming an argument that can't take effect, see :meth:`follow_arguments`
+        """
+        self.follow_arguments()  # a file must not hold a value that no model can be made with
+        super().save(path, exclude, include)
 
     def _change_arguments(self, given: dict[str, Any], of: str = "load()") -> None:
         """
@@ -52,23 +68,23 @@ class ChangingArguments(BaseAlgorithm):
 
         :param given: name -> value
         :param of: what changes the arguments, for the message
-        :raises ValueError: naming the argument; all arguments are then what they were before
+        :raises ValueError: naming the argument; the model is then as it was before
         """
         if not given:
             return
-        before, built_of = arguments_of(self), self._built_of()
+        before, attributes, built_of = arguments_of(self), dict(vars(self)), self._built_of()
         try:
             set_arguments(self, given)
             make_arguments_plain(self)
             self._check_arguments()
             self._check_coefficients()
             check_not_built_in(given, built_of, self._built_of(), of)
-        except ValueError:
-            set_arguments(self, before)
+            self._remake_coefficients(set(given), before)
+            self.take_effect(set(given))
+        except Exception:
+            vars(self).update(attributes)
             raise
-        self._remake_coefficients(set(given), before)
-        self.take_effect(set(given))
-        self._in_force = arguments_of(self)
+        self.keep_in_force()
 
     def _built_of(self) -> dict[str, Any]:
         """Name -> value of all that networks and data are built of."""
@@ -90,7 +106,7 @@ class ChangingArguments(BaseAlgorithm):
             coefficient, spec = self.coefficients[name], getattr(self, name, None)
             if spec == before.get(name) or (spec == "auto" and isinstance(coefficient, LearnedCoefficient)):
                 fresh[name].go_on_from(coefficient)
-            self.coefficients[name] = fresh[name]
+        self.coefficients = {name: fresh[name] if name in remade else kept for name, kept in self.coefficients.items()}
         self._keep_coefficients()
         self.programs.clear()  # programs hold the former ones
 
@@ -98,6 +114,8 @@ class ChangingArguments(BaseAlgorithm):
     def take_effect(self, changed: set[str]) -> None:
         """
         Make anew what was made of arguments; whatever reads an argument at each use needs nothing.
+
+        What may fail comes first, and new objects take the place of former ones: after an error all attributes are put back.
 
         :param changed: names of the arguments that have changed
         """
@@ -133,6 +151,18 @@ def set_arguments(model: Any, arguments: Mapping[str, Any]) -> None:
     vars(model).update({KEPT_AS.get(name, name): value for name, value in arguments.items()})
 
 
+def copied(value: Any) -> Any:
+    """
+    Copy the containers of an argument, so that a change in place can be told.
+
+    :param value: value of the argument
+    :return: dicts, lists, tuples and sets with the same contents; anything else is returned itself
+    """
+    if isinstance(value, Mapping):
+        return {key: copied(entry) for key, entry in value.items()}
+    return type(value)(map(copied, value)) if type(value) in (list, tuple, set) else value
+
+
 def differ(value: Any, before: Any) -> bool:
     """
     Whether an argument has changed.
@@ -143,6 +173,7 @@ def differ(value: Any, before: Any) -> bool:
     """
     if value is before:
         return False
+    value, before = copied(value), copied(before)
     try:
         return not (type(value) is type(before) and bool(value == before))
     except (TypeError, ValueError):  # dicts and lists that hold arrays

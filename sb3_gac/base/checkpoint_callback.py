@@ -10,9 +10,10 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_gac.base.resuming import ResumableAlgorithm
+from sb3_gac.base.resuming import ResumableAlgorithm, encode_notes
+from sb3_gac.checkpoint.files import checkpoints
 from sb3_gac.checks.environments import EnvironmentFailedError
-from sb3_gac.checks.values import as_sentence
+from sb3_gac.checks.values import as_sentence, described
 from sb3_gac.optim.compile import is_compiling
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -24,19 +25,20 @@ class ExactCheckpointCallback(BaseCallback):
 
     The callback calls :meth:`ResumableAlgorithm.save_checkpoint`, on a schedule and on signals. SIGTERM, which pre-empting
     schedulers send, and Ctrl-C have the step finished and a checkpoint written. Then the process ends with a message that
-    says how to go on: ``SystemExit`` with status 143, or ``KeyboardInterrupt``. A second signal ends the process at once,
-    because an environment may hang. Ctrl-C also does so while gradient steps are being compiled, because in a terminal it
-    ends the compiler's processes as well. If a checkpoint can't be written, on a full disk for example, the callback warns,
-    training goes on, and the checkpoint before it stays.
+    says how to go on: ``SystemExit`` with status 143, or ``KeyboardInterrupt``, also if no checkpoint can be made. A second
+    signal ends the process at once, because an environment may hang. Ctrl-C also does so while gradient steps are being
+    compiled, because in a terminal it ends the compiler's processes as well. If a checkpoint can't be written, on a full
+    disk for example, the callback warns, training goes on, and the checkpoint before it stays.
 
     :param directory: folder in which the checkpoints are written
     :param every: number of environment steps between two checkpoints
     :param keep: number of checkpoints to keep, the latest ones
-    :param notes: function without arguments, called for each checkpoint, whose value is kept with it (anything that JSON can
-        hold); ``None`` for no notes
+    :param notes: function without arguments, called for each checkpoint and when ``learn`` begins, whose value is kept with
+        the checkpoint (anything that JSON can hold, and numbers and arrays of numpy and torch); ``None`` for no notes
     :param on_signals: whether to act on SIGTERM and Ctrl-C, which is possible in the main thread only
     :param at_start: whether to write a checkpoint before the first step, so that there is one from the start
     :raises ValueError: if ``every`` or ``keep`` is not positive
+    :raises TypeError: when ``learn`` begins, if no checkpoint can hold the model's data (``HerReplayBuffer``) or the notes
     """
 
     model: ResumableAlgorithm
@@ -68,6 +70,13 @@ class ExactCheckpointCallback(BaseCallback):
     def _init_callback(self) -> None:
         if not isinstance(self.model, ResumableAlgorithm):
             raise TypeError(f"{type(self.model).__name__} has no save_checkpoint(): use SB3's CheckpointCallback.")
+        self.model.check_data_can_be_saved()
+        if self.notes is not None:
+            try:
+                notes = self.notes()
+            except Exception:  # there may be nothing to note before the first step
+                return
+            encode_notes(notes)
 
     def _on_training_start(self) -> None:
         self._next = self.model.num_timesteps + (0 if self.at_start else self.every)
@@ -102,27 +111,34 @@ class ExactCheckpointCallback(BaseCallback):
             self._end_process(self._caught)
         if self.model.num_timesteps >= self._next:
             self._next = self.model.num_timesteps + self.every
-            self._save()
+            try:
+                self._save()
+            except OSError as error:
+                self._warn_of_failure(error, "Training goes on.")
 
-    def _save(self) -> bool:
-        try:
-            self.model.save_checkpoint(self.directory, self.keep, None if self.notes is None else self.notes())
-        except OSError as error:
-            warnings.warn(
-                f"The checkpoint after {self.model.num_timesteps} steps could not be written to {self.directory}: "
-                f"{as_sentence(error)} Training goes on, and the checkpoint before it is as it was.",
-                stacklevel=2,
-            )
-            return False
-        return True
+    def _save(self) -> None:
+        self.model.save_checkpoint(self.directory, self.keep, None if self.notes is None else self.notes())
+
+    def _warn_of_failure(self, error: Exception, then: str) -> None:
+        failed = f"The checkpoint after {self.model.num_timesteps} steps could not be written to {self.directory}"
+        what = as_sentence(error) if isinstance(error, OSError) else described(error)
+        warnings.warn(f"{failed}: {what} {then} The checkpoint before it is as it was.", stacklevel=3)
 
     def _end_process(self, number: int) -> None:
-        saved = f"after {self.model.num_timesteps} steps" if self._save() else "before the last one failed"
-        message = (
-            f"Stopped by {signal.Signals(number).name}; the checkpoint {saved} is in {self.directory}. To go on: model = "
-            f'{type(self.model).__name__}.resume("{self.directory}", env), then '
-            "model.learn(model.steps_left, reset_num_timesteps=False)."
-        )
+        name, saved = signal.Signals(number).name, f"after {self.model.num_timesteps} steps"
+        try:
+            self._save()
+        except Exception as error:  # whatever it is, the process was told to end
+            self._warn_of_failure(error, "What was trained since the one before it is lost.")
+            saved = "before the one that failed"
+        if checkpoints(self.directory):
+            message = (
+                f"Stopped by {name}; the checkpoint {saved} is in {self.directory}. To go on: model = "
+                f'{type(self.model).__name__}.resume("{self.directory}", env), then '
+                "model.learn(model.steps_left, reset_num_timesteps=False)."
+            )
+        else:
+            message = f"Stopped by {name}; no checkpoint is in {self.directory}."
         if number == signal.SIGINT:
             raise KeyboardInterrupt(message)
         warnings.warn(message, stacklevel=2)

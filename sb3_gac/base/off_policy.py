@@ -3,6 +3,7 @@
 import warnings
 from abc import abstractmethod
 from collections.abc import Mapping
+from math import ceil
 from os import PathLike
 from typing import Any, ClassVar
 
@@ -25,7 +26,13 @@ from sb3_gac.base.replay_data import ReplayData
 from sb3_gac.base.roles import RoleKeys, resolve_role_keys, resolve_update_every
 from sb3_gac.checks.arguments import COMMON_CHECKS, OFF_POLICY_CHECKS, ArgumentCheck, check_train_freq
 from sb3_gac.checks.entries import check_held_by
-from sb3_gac.checks.requirements import check_action_noise, check_goals, check_hindsight, check_rewards_of_goals
+from sb3_gac.checks.requirements import (
+    check_action_noise,
+    check_goals,
+    check_hindsight,
+    check_rewards_of_goals,
+    warn_of_no_gradient_step,
+)
 from sb3_gac.networks.heads import resolve_target_entropy
 from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
@@ -233,10 +240,15 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
 
     # --- learning ---------------------------------------------------------------------------------------------------
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+    def _setup_learn(
+        self, total_timesteps: int, callback: MaybeCallback = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
+    ) -> Any:
         self._check_before_training()
         self._recorded = None if self.recording is None else Recording(self.recording, self.n_envs)
-        result = super()._setup_learn(*args, **kwargs)
+        if self._recorded is not None:
+            end = total_timesteps + (0 if reset_num_timesteps else self.num_timesteps)
+            self._recorded.check_length(ceil(end / self.n_envs))
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
         assert self.env is not None
         check_rewards_of_goals(self.replay_buffer_class, self.replay_buffer_kwargs, self.env)
         return result
@@ -264,8 +276,18 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
     ) -> Self:
         """See SB3's ``OffPolicyAlgorithm.learn``; by default TensorBoard's runs have the name of the class."""
         self.follow_arguments()  # SB3 looks at train_freq first
+        if reset_num_timesteps:  # otherwise further calls may go on from this one
+            warn_of_no_gradient_step(self, total_timesteps)
+            self.warn_of_networks_at_rest(total_timesteps)
         tb_log_name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def warn_of_networks_at_rest(self, total_timesteps: int) -> None:
+        """
+        Called before a training; an algorithm with phases warns if the training ends before a phase that networks need.
+
+        :param total_timesteps: number of environment steps of the training, from its start
+        """
 
     @property
     def history_length(self) -> int:

@@ -87,9 +87,12 @@ class OptimizedPolicy(ActingPolicy):
         Change the multiples of the learning rate.
 
         :param lr_scales: network -> multiple of the learning rate, in place of all former multiples; ``None`` for 1 each
+        :raises ValueError: naming a multiple that can't be; all multiples are then what they were before
         """
-        self.constructor_options["lr_scales"] = lr_scales
         scales = resolve_lr_scales(self.roles, lr_scales)
+        for trained in self.trained.values():
+            trained.check_memory_scale(scales[MEMORY])
+        self.constructor_options["lr_scales"] = lr_scales
         for role, trained in self.trained.items():
             trained.optimizer.param_groups[0]["lr_scale"] = scales[role]
             trained.scale_memory(scales[MEMORY])

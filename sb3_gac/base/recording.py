@@ -51,6 +51,19 @@ class Recording:
         if recorded != n_envs:
             raise ValueError(f"recording is of {recorded} environments, but the model has {n_envs}: make as many.")
 
+    def check_length(self, steps: int) -> None:
+        """
+        Check that there are actions for a whole training.
+
+        :param steps: number of steps of each environment at the end of training
+        :raises ValueError: if the recorded run had fewer steps
+        """
+        if steps > len(self._actions):
+            raise ValueError(
+                f"recording ends after {len(self._actions)} steps of each environment, and training would end after {steps}: "
+                "train no longer than the recorded run."
+            )
+
     def actions(self, step: int) -> np.ndarray:
         """
         The recorded actions of a step.

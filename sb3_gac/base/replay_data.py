@@ -169,12 +169,10 @@ class ReplayData(OffPolicyAlgorithm):
 
     # --- checkpoints ------------------------------------------------------------------------------------------------
 
-    def save_data(self, root: Path) -> tuple[dict[str, Any], list[str]]:
+    def check_data_can_be_saved(self) -> None:
         """
-        Write the rows of the replay buffer that have changed since the last checkpoint.
+        Check that a checkpoint can hold the replay buffer.
 
-        :param root: folder of all checkpoints of a run
-        :return: state of the buffer besides its rows, and the names of all blocks of rows
         :raises TypeError: if there is no replay buffer, or it is of another class than this package's
         """
         buffer = self.replay_buffer
@@ -185,6 +183,18 @@ class ReplayData(OffPolicyAlgorithm):
                 f"A checkpoint can hold a CompactDictReplayBuffer or a subclass, but replay_buffer_class is "
                 f"{type(buffer).__name__}: leave it out, or use save() and save_replay_buffer()."
             )
+
+    def save_data(self, root: Path) -> tuple[dict[str, Any], list[str]]:
+        """
+        Write the rows of the replay buffer that have changed since the last checkpoint.
+
+        :param root: folder of all checkpoints of a run
+        :return: state of the buffer besides its rows, and the names of all blocks of rows
+        :raises TypeError: see :meth:`check_data_can_be_saved`
+        """
+        self.check_data_can_be_saved()
+        buffer = self.replay_buffer
+        assert isinstance(buffer, CompactDictReplayBuffer)
         self._saved_blocks = write_rows(buffer, root, self._saved_blocks)
         return buffer.bookkeeping() | {"blocks": self._saved_blocks.names}, self._saved_blocks.names
 

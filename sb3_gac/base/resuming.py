@@ -27,6 +27,7 @@ from sb3_gac.checkpoint.files import CheckpointError, checksum, latest_whole, wr
 from sb3_gac.checkpoint.serialization import UntrustedNameError, decode, encode
 from sb3_gac.checkpoint.vec_env import restore_vec_env_state, vec_env_state
 from sb3_gac.checks.arguments import KEPT_AS, constructor_arguments
+from sb3_gac.checks.values import plain
 
 #: Parts of a checkpoint's state that are encoded as JSON and arrays
 STATES = ("progress", "training_state", "generators", "env", "buffer")
@@ -68,8 +69,11 @@ class ResumableAlgorithm(BaseAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
     policy: AsymmetricPolicy
     _change_arguments: Callable[[dict[str, Any]], None]
+    follow_arguments: Callable[[], None]
     note_use: Callable[[], None]
     used_elsewhere: Callable[[VecEnv], bool]
+    #: Raises a TypeError if no checkpoint can hold the training data
+    check_data_can_be_saved: Callable[[], None]
     #: Function of the folder of all checkpoints: writes blocks of training data there, and returns the rest of the data and
     #: the names of all blocks
     save_data: Callable[[Path], tuple[dict[str, Any], list[str]]]
@@ -99,12 +103,16 @@ class ResumableAlgorithm(BaseAlgorithm):
 
         :param directory: folder of all checkpoints of this run
         :param keep: number of checkpoints to keep, the latest ones
-        :param notes: further data to keep in the checkpoint, anything that JSON can hold, see :attr:`resumed_notes`
+        :param notes: further data to keep in the checkpoint, see :attr:`resumed_notes`: anything that JSON can hold, and
+            numbers and arrays of numpy and torch
         :return: folder of this checkpoint
         :raises OSError: if the checkpoint can't be written; the checkpoints before it are as they were
         :raises TypeError: if the replay buffer can't be written, because it is missing or of another class than this
-            package's
+            package's, or if JSON can't hold the notes
+        :raises ValueError: naming an argument that was set on the model and can't take effect
         """
+        self.follow_arguments()
+        as_notes = encode_notes(notes)  # before anything is written
         root = Path(directory).absolute()
         data, blocks = self.save_data(root)
         arrays: dict[str, np.ndarray] = {}
@@ -119,7 +127,7 @@ class ResumableAlgorithm(BaseAlgorithm):
             "env": encode(None if self.env is None else vec_env_state(self.env), arrays),
             "used_elsewhere": self.env is not None and self.used_elsewhere(self.env),
             "buffer": encode(data, arrays),
-            "notes": notes,
+            "notes": json.loads(as_notes),
         }
         files = {
             _STATE: json.dumps(state).encode(),
@@ -273,6 +281,21 @@ class ResumableAlgorithm(BaseAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "resumed_notes", "learn_scope"]
+
+
+def encode_notes(notes: Any) -> str:
+    """
+    Convert the notes of a checkpoint to JSON.
+
+    :param notes: anything that JSON can hold, and numbers and arrays of numpy and torch
+    :return: notes as JSON
+    :raises TypeError: if JSON can't hold them
+    """
+    try:
+        return json.dumps(plain(notes, arrays=True))
+    except (TypeError, ValueError) as error:
+        held = "what JSON can hold (numbers, strings, lists, dicts)"
+        raise TypeError(f"notes must be {held}, got {notes!r}: {error}") from error
 
 
 def _qualified_name(algorithm: type) -> str:

@@ -102,6 +102,9 @@ class RolloutCollection(OnPolicyAlgorithm):
     def keep_first_observations(self) -> None:
         """Called after a reset of the environments; a rollout buffer needs nothing then."""
 
+    def check_data_can_be_saved(self) -> None:
+        """Do nothing: a checkpoint can hold every rollout buffer."""
+
     def save_data(self, root: Path) -> tuple[dict[str, Any], list[str]]:
         """
         The rollout under way, for a checkpoint.
@@ -241,5 +244,6 @@ class RolloutCollection(OnPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> Self:
         """See SB3's ``OnPolicyAlgorithm.learn``; by default TensorBoard's runs have the name of the class."""
+        self.follow_arguments()  # before anything of the training has begun
         tb_log_name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

@@ -1,5 +1,6 @@
 """Rapid Motor Adaptation: learn with a latent of the privileged entries, then estimate the latent from the history."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -136,6 +137,16 @@ class RMA(AsymmetricOffPolicyAlgorithm):
 
     def _policy_options(self) -> dict[str, Any]:
         return super()._policy_options() | {"history": self.history}
+
+    def warn_of_networks_at_rest(self, total_timesteps: int) -> None:
+        """Warn before a training that ends in phase 1, see :meth:`AsymmetricOffPolicyAlgorithm.warn_of_networks_at_rest`."""
+        if self.phase_1_steps is not None and self.learning_starts < total_timesteps <= self.phase_1_steps:
+            warnings.warn(
+                f"RMA ends in phase 1, because phase_1_steps is {self.phase_1_steps} and training ends after "
+                f"{total_timesteps} steps: the deployed actor's estimate of z stays untrained. Lower phase_1_steps or leave "
+                "it out, raise total_timesteps, or go on by learn(..., reset_num_timesteps=False).",
+                stacklevel=3,
+            )
 
     def choose_acting(self, episode_start: np.ndarray) -> list[str]:
         """The policy that acts in each environment: by default the expert in phase 1, and the actor in phase 2."""

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Collection, Mapping, Sequence
+from math import ceil
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +11,8 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gac.checks.entries import check_entries, stored_shape
@@ -205,3 +207,24 @@ def warn_of_other_rewards(
 
 def _is_hindsight(buffer_class: Any) -> bool:
     return isinstance(buffer_class, type) and issubclass(buffer_class, HerReplayBuffer)
+
+
+def warn_of_no_gradient_step(model: OffPolicyAlgorithm, total_timesteps: int) -> None:
+    """
+    Warn before a training that ends within the warm-up.
+
+    :param model: model that is about to learn
+    :param total_timesteps: number of environment steps of the training, from its start
+    """
+    train_freq = model.train_freq
+    assert isinstance(train_freq, TrainFreq)
+    if train_freq.unit is TrainFrequencyUnit.EPISODE or total_timesteps == 0 or model.gradient_steps == 0:
+        return  # an episode may be of any length; the others ask for no gradient step
+    rollout = train_freq.frequency * model.n_envs
+    steps = ceil(total_timesteps / rollout) * rollout
+    if steps <= model.learning_starts:
+        warnings.warn(
+            f"learn makes no gradient step: learning_starts is {model.learning_starts}, and training ends after {steps} "
+            "steps. Lower learning_starts, or raise total_timesteps.",
+            stacklevel=3,
+        )

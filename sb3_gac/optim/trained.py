@@ -79,9 +79,9 @@ class TrainedParameters:
             self._powers_follow = self._powers_follow if compiled is None else compiled
         group["trained"] = trained
 
-    def scale_memory(self, scale: float) -> None:
+    def check_memory_scale(self, scale: float) -> None:
         """
-        Set the learning rate of the memory's parameters.
+        Check that the memory's parameters can have a learning rate of their own.
 
         :param scale: multiple of the network's learning rate
         :raises ValueError: if the optimiser can have only one learning rate for all parameters
@@ -92,6 +92,15 @@ class TrainedParameters:
                 f"fused=False, but the optimiser is {type(self.optimizer).__name__}: leave it out, or choose another "
                 "optimizer_class."
             )
+
+    def scale_memory(self, scale: float) -> None:
+        """
+        Set the learning rate of the memory's parameters.
+
+        :param scale: multiple of the network's learning rate
+        :raises ValueError: see :meth:`check_memory_scale`
+        """
+        self.check_memory_scale(scale)
         self.optimizer.param_groups[0]["memory_lr_scale"] = scale
 
     def _learning_rates(self) -> list[float]:

@@ -110,6 +110,12 @@ def test_shares_that_are_none_are_refused(shares):
         Behaviour(ROLES, shares)
 
 
+@pytest.mark.parametrize("share", ["linear 0.5 -> 1.5", lambda left: 1.2 - left, lambda left: 2.0 if left == 0.5 else 0.0])
+def test_shares_that_leave_their_range_later_are_refused_at_once(share):
+    with pytest.raises(ValueError, match=r"behaviour must be shares from 0 to 1 .* where 0?\.?\d+ of training remains"):
+        small_model(behaviour={"learner": share})
+
+
 @pytest.mark.parametrize("behaviour", ["critic", "nobody", {"critic": 0.5}])
 def test_who_is_no_policy_is_refused(behaviour):
     with pytest.raises(ValueError, match="behaviour"):

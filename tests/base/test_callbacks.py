@@ -10,13 +10,20 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import StopTrainingOnRewardThreshold
+from stable_baselines3.common.callbacks import ConvertCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricSAC, GPOPenalty, GuiderLearnerEvalCallback, SeededEvalCallback
+from sb3_gac import (
+    GAC,
+    AsymmetricSAC,
+    ExactCheckpointCallback,
+    GPOPenalty,
+    GuiderLearnerEvalCallback,
+    SeededEvalCallback,
+)
 from tests.helpers import Sampled
 
 EPISODE_LENGTH = 5
@@ -44,6 +51,12 @@ class Paid(gym.Env):
     def step(self, action):
         self.steps += 1
         return self._observe(), float(action[0]) + self.bonus, False, self.steps == EPISODE_LENGTH, {}
+
+    def checkpoint_state(self):
+        return {"steps": self.steps, "bonus": self.bonus}
+
+    def restore_checkpoint_state(self, state):
+        self.steps, self.bonus = state["steps"], state["bonus"]
 
     def _observe(self):
         partial = self.np_random.normal(3.0, 2.0, 2).astype(np.float32)
@@ -323,6 +336,7 @@ def test_says_nothing_before_there_were_gradient_steps():
     callback = _callback(_vec_env(), eval_freq=2, patience=1, gap_tolerance=1e6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "learn makes no gradient step")
         _model(_vec_env(), learning_starts=100).learn(6, callback=callback)
     assert len(callback.history) == 3
     assert "kl" not in callback.history[-1]
@@ -372,3 +386,78 @@ def test_a_weight_that_holds_nobody_any_more_is_told_of_gpo_in_its_own_words():
     assert any("the learner does not keep up. Raise largest_kl_coef." in message for message in said)
     assert any("kl_coef sits on a bound (0.01), and KL" in message and "Raise largest_kl_coef." in message for message in said)
     assert not any("max_kl" in message or "kl_coef_bounds" in message for message in said)
+
+
+# --- a training that goes on -----------------------------------------------------------------------------------------
+
+
+def _files(folder):
+    return {path.name: dict(np.load(path)) for path in folder.glob("*.npz")}
+
+
+def _interrupted(folder):
+    """A training of 40 steps whose process ended after 30, with a checkpoint after 24; evaluations are in the folder."""
+    evaluation, checkpoint = _callback(_vec_env(), log_path=str(folder)), ExactCheckpointCallback(folder, every=24)
+    stop = ConvertCallback(lambda scope, _: scope["self"].num_timesteps < 30)
+    _model(_vec_env()).learn(40, callback=[evaluation, checkpoint, stop])
+    return GAC.resume(folder, _vec_env(), device="cpu")
+
+
+def test_a_resumed_training_goes_on_with_the_files_of_evaluations(tmp_path):
+    whole = _callback(_vec_env(), log_path=str(tmp_path / "whole"))
+    _model(_vec_env()).learn(40, callback=whole)
+    resumed, rest = _interrupted(tmp_path / "parts"), _callback(_vec_env(), log_path=str(tmp_path / "parts"))
+    assert _files(tmp_path / "parts")["evaluations.npz"]["timesteps"].tolist() == [10, 20, 30]  # 30 is after the checkpoint
+    resumed.learn(resumed.steps_left, reset_num_timesteps=False, callback=rest)
+    assert [row["timesteps"] for row in rest.history] == [10, 20, 30, 40]
+    assert rest.best_mean_reward == whole.best_mean_reward
+    expected, found = _files(tmp_path / "whole"), _files(tmp_path / "parts")
+    assert set(found) == set(expected) == {"evaluations.npz", "guider_evaluations.npz"}
+    for name in ("timesteps", "results", "ep_lengths"):
+        np.testing.assert_array_equal(found["evaluations.npz"][name], expected["evaluations.npz"][name])
+    for name in ("timesteps", "guider", "learner"):
+        np.testing.assert_array_equal(found["guider_evaluations.npz"][name], expected["guider_evaluations.npz"][name])
+
+
+def test_a_worse_model_does_not_replace_the_best_one_after_a_resume(tmp_path):
+    folders = {"log_path": str(tmp_path), "best_model_save_path": str(tmp_path)}
+    resumed = _interrupted(tmp_path)
+    rows = dict(np.load(tmp_path / "evaluations.npz"))
+    rows["results"][0] = 1e6
+    np.savez(tmp_path / "evaluations.npz", **rows)
+    callback = SeededEvalCallback(_vec_env(), eval_freq=10, n_eval_episodes=4, verbose=0, **folders)
+    resumed.learn(resumed.steps_left, reset_num_timesteps=False, callback=callback)
+    assert callback.best_mean_reward == 1e6
+    assert not (tmp_path / "best_model.zip").exists()
+
+
+def test_a_new_training_starts_its_files_anew(tmp_path):
+    for _ in range(2):
+        callback = _callback(_vec_env(), log_path=str(tmp_path))
+        _model(_vec_env()).learn(20, callback=callback)
+        assert [row["timesteps"] for row in callback.history] == [10, 20]
+    assert {tuple(file["timesteps"]) for file in _files(tmp_path).values()} == {(10, 20)}
+
+
+def test_a_callback_that_goes_on_itself_reads_no_file(tmp_path):
+    model, callback = _model(_vec_env()), _callback(_vec_env(), log_path=str(tmp_path))
+    for _ in range(2):
+        model.learn(20, callback=callback, reset_num_timesteps=False)
+    assert [row["timesteps"] for row in callback.history] == [10, 20, 30, 40]
+    assert _files(tmp_path)["evaluations.npz"]["timesteps"].tolist() == [10, 20, 30, 40]
+
+
+def test_evaluations_of_another_number_of_episodes_are_refused_and_kept(tmp_path):
+    resumed, before = _interrupted(tmp_path), _files(tmp_path)["evaluations.npz"]["results"]
+    callback = _callback(_vec_env(), log_path=str(tmp_path), n_eval_episodes=3)
+    with pytest.raises(ValueError, match="evaluations of 4 episodes, but n_eval_episodes is 3: give the former number"):
+        resumed.learn(resumed.steps_left, reset_num_timesteps=False, callback=callback)
+    np.testing.assert_array_equal(_files(tmp_path)["evaluations.npz"]["results"], before)
+
+
+def test_a_file_of_evaluations_that_is_cut_off_is_a_warning(tmp_path):
+    resumed, path = _interrupted(tmp_path), tmp_path / "evaluations.npz"
+    path.write_bytes(path.read_bytes()[:100])
+    callback = _callback(_vec_env(), log_path=str(tmp_path))
+    with pytest.warns(UserWarning, match=r"evaluations.npz can't be read, and evaluations start anew there: BadZipFile"):
+        resumed.learn(resumed.steps_left, reset_num_timesteps=False, callback=callback)

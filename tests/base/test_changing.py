@@ -1,5 +1,7 @@
 """Arguments that are set on a model in the middle of training: they count as if ``resume`` had got them, or are refused."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch as th
@@ -11,7 +13,7 @@ from sb3_gac.algorithms import algorithm_class
 from sb3_gac.base.changing import arguments_of
 from sb3_gac.checks.arguments import KEPT_AS, constructor_arguments
 from tests import registry
-from tests.helpers import TwoViewBandit, small_model
+from tests.helpers import TwoViewBandit, TwoViewChoice, small_model
 
 #: Argument -> another value than the small model's
 OTHERS = {
@@ -156,17 +158,122 @@ def test_what_a_model_was_built_of_is_refused_and_training_can_go_on(algorithm, 
     _go_on(model)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("tau", 2.0), ("target_kl", -1.0), ("behaviour", "nobody"), ("train_freq", "often")]
-)
-def test_a_wrong_value_is_refused_by_name_and_training_can_go_on(name, value):
-    model = _learned("gac")
-    before = arguments_of(model)
+#: Algorithm -> wrong values of its arguments: of all coefficients, and of what networks, data and teachers are asked for
+WRONG = {
+    "gac": [
+        *(("tau", 2.0), ("target_kl", -1.0), ("behaviour", "nobody"), ("train_freq", "often"), ("ent_coef", "oops")),
+        *(("kl_coef", -1.0), ("kl_coef_bounds", (3.0, 1.0)), ("kl_coef_learning_rate", 0.0), ("lr_scales", {"nobody": 1.0})),
+    ],
+    "asymmetric_mpo": [(name, "auto_1e9") for name in ("temperature", "kl_coef", "std_kl_coef")],
+    "tgrl": [("teacher_coef", -1.0), ("teacher", "nowhere.zip")],
+    "cosil": [("teacher_coef", "oops"), ("teacher_coef_bounds", (3.0, 1.0)), ("teacher", "nowhere.zip")],
+    "gpo_penalty": [("largest_kl_coef", -1.0)],
+}
+
+
+def _refuses(model, name, value, tmp_path):
+    """Whether a value that is set is refused as if it had never been there, also in files that are written afterwards."""
+    before, coefficients = arguments_of(model), model.coefficients
     _set(model, name, value)
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises((ValueError, OSError), match=name if name != "teacher" else "nowhere|teacher"):
         model.learn(40, reset_num_timesteps=False)
     assert arguments_of(model) == before
+    assert model.coefficients is coefficients
+    model.save(tmp_path / "model.zip")
+    model.save_checkpoint(tmp_path / "checkpoints")
+    now, frozen = _go_on(model), {each: getattr(model, each) for each in model.frozen_arguments}
+    type(model).load(tmp_path / "model.zip", _env(), **frozen)
+    assert now.equal(_go_on(type(model).resume(tmp_path / "checkpoints", _env(), "cpu", **frozen)))
+
+
+@pytest.mark.parametrize(("algorithm", "name", "value"), [(name, *pair) for name, pairs in WRONG.items() for pair in pairs])
+def test_a_wrong_value_is_refused_by_name_and_training_can_go_on(algorithm, name, value, tmp_path):
+    _refuses(_learned(algorithm), name, value, tmp_path)
+
+
+def test_a_teacher_of_other_spaces_is_refused_and_the_former_one_teaches_on(tmp_path):
+    other = AsymmetricSAC("MultiInputPolicy", TwoViewChoice(), role_keys={"actor": ["partial", "privileged"]}, buffer_size=1)
+    _refuses(_learned("cosil"), "teacher", other, tmp_path)
+
+
+def test_a_learning_rate_of_the_memory_that_the_optimiser_can_not_have_is_refused(tmp_path):
+    options = {"rnn_type": "gru", "rnn_hidden_size": 8, "rnn_net_arch": [], "net_arch": [8], "optimizer_class": th.optim.SGD}
+    model = registry.make("gac", _env(), seed=0, policy_kwargs=options).learn(40)
+    _refuses(model, "lr_scales", {"memory": 0.1, "critic": 3.0}, tmp_path)
+    assert {getattr(model.policy, role).optimizer.param_groups[0]["lr_scale"] for role in model.policy.trained} == {1.0}
+
+
+def test_values_beside_a_wrong_one_are_refused_with_it():
+    model = _learned("gac")
+    before = arguments_of(model)
+    model.target_kl, model.behaviour, model.kl_coef = 0.5, "learner", -1.0
+    with pytest.raises(ValueError, match="kl_coef"):
+        model.learn(40, reset_num_timesteps=False)
+    assert arguments_of(model) == before
+    assert model.target_kl_schedule(1.0) == before["target_kl"]
+
+
+def test_a_wrong_value_comes_into_no_file(tmp_path):
+    model = _learned("gac")
+    for save in (lambda: model.save(tmp_path / "model.zip"), lambda: model.save_checkpoint(tmp_path)):
+        model.ent_coef = "oops"
+        with pytest.raises(ValueError, match="ent_coef"):
+            save()
+        save()
+    GAC.load(tmp_path / "model.zip", _env())
+    GAC.resume(tmp_path, _env())
+
+
+def test_a_value_that_was_just_set_is_in_files_with_what_is_made_of_it(tmp_path):
+    model = _learned("gac")
+    model.ent_coef = 0.3
+    model.save(tmp_path / "model.zip")
+    assert GAC.load(tmp_path / "model.zip", _env()).ent_coef_tensor == pytest.approx(0.3)
+
+
+#: Arguments that are dicts: before, and what changes in place
+IN_PLACE = [
+    ("behaviour", {"learner": 0.0}, ("learner", 1.0)),
+    ("lr_scales", {"learner": 1.0}, ("learner", 0.1)),
+    ("update_every", {"learner": 1}, ("learner", 3)),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "entry"), IN_PLACE)
+def test_a_dict_that_changes_in_place_counts_as_one_that_is_set(name, value, entry):
+    in_place = _learned("gac", **{name: dict(value)})
+    getattr(in_place, name).update([entry])
+    now, by_value = _go_on(in_place), _learned("gac", **{name: dict(value)})
+    setattr(by_value, name, dict([entry]))
+    assert now.equal(_go_on(by_value))
+    assert not now.equal(_go_on(_learned("gac", **{name: value})))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "entry"),
+    [
+        ("replay_buffer_kwargs", {"mask_truncations": False}, ("mask_truncations", True)),
+        ("policy_kwargs", {"net_arch": {"critic": [8], "actor": [8]}}, ("net_arch", {"critic": [9], "actor": [8]})),
+        ("behaviour", {"learner": 0.0}, ("learner", 2.0)),
+    ],
+)
+def test_a_dict_that_changes_in_place_to_what_can_not_be_is_refused_each_time(name, value, entry):
+    model = _learned("asymmetric_sac" if name != "behaviour" else "gac", **{name: value})
+    before = deepcopy(getattr(model, name))
+    for _ in range(2):
+        getattr(model, name).update([entry])
+        with pytest.raises(ValueError, match=name):
+            model.learn(40, reset_num_timesteps=False)
+        assert getattr(model, name) == before
     _go_on(model)
+
+
+def test_a_list_within_a_dict_is_followed_as_well():
+    model = _learned("asymmetric_sac", policy_kwargs={"net_arch": [8]})
+    model.policy_kwargs["net_arch"].append(8)
+    with pytest.raises(ValueError, match="policy_kwargs"):
+        model.learn(40, reset_num_timesteps=False)
+    assert model.policy_kwargs["net_arch"] == [8]
 
 
 def test_every_argument_of_every_algorithm_has_a_test():

@@ -5,8 +5,10 @@ import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -237,3 +239,56 @@ def test_ctrl_c_in_a_terminal_ends_the_environments_too_and_makes_a_checkpoint(t
     with pytest.warns(UserWarning, match="Starting new episodes"):
         resumed = GAC.resume(tmp_path, DummyVecEnv([TwoViewBandit] * 2), device="cpu")
     assert resumed.learn(8, reset_num_timesteps=False).replay_buffer.pos == 18
+
+
+def test_a_replay_buffer_that_no_checkpoint_can_hold_is_refused_before_training(tmp_path):
+    model = small_model(TwoViewBandit(length=5), replay_buffer_class=DictReplayBuffer)
+    with pytest.raises(TypeError, match="replay_buffer_class is DictReplayBuffer: leave it out, or use save"):
+        model.learn(100, callback=ExactCheckpointCallback(tmp_path, every=30))
+    assert model.num_timesteps == 0
+
+
+def test_notes_that_no_checkpoint_can_hold_are_refused_before_training(tmp_path):
+    model = small_model(TwoViewBandit(length=5))
+    with pytest.raises(TypeError, match="notes must be what JSON can hold"):
+        model.learn(100, callback=ExactCheckpointCallback(tmp_path, every=30, notes=lambda: {"env": model.env}))
+    assert model.num_timesteps == 0
+    with pytest.raises(TypeError, match="notes must be what JSON can hold"):
+        model.save_checkpoint(tmp_path, notes={"env": model.env})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_notes_may_have_numbers_of_other_libraries_and_nothing_to_note_at_first(tmp_path):
+    model, seen = small_model(TwoViewBandit(length=5)), []
+    watch = ConvertCallback(lambda scope, _: seen.append(scope["self"].num_timesteps) or True)
+
+    def notes():
+        return {"last": np.float32(seen[-1]), "mean": th.tensor(0.5), "all": np.arange(2), "lines": ({"step": np.int64(3)},)}
+
+    model.learn(40, callback=[watch, ExactCheckpointCallback(tmp_path, every=30, notes=notes)])
+    resumed = GAC.resume(tmp_path, TwoViewBandit(length=5), device="cpu")
+    assert resumed.resumed_notes == {"last": 30.0, "mean": 0.5, "all": [0, 1], "lines": [{"step": 3}]}
+
+
+@pytest.mark.parametrize(
+    ("every", "found"), [(1000, "no checkpoint is in"), (20, "the checkpoint before the one that failed is in")]
+)
+def test_a_signal_ends_the_process_whatever_keeps_the_checkpoint_from_being_made(every, found, tmp_path):
+    class Signalling(TwoViewBandit):
+        def step(self, action):
+            if model.num_timesteps == 30:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return super().step(action)
+
+    def notes():
+        if model.num_timesteps > 30:
+            raise RuntimeError("nothing to note")
+
+    model = small_model(Signalling(length=5))
+    with (
+        pytest.warns(UserWarning, match="SIGTERM: the step is finished"),
+        pytest.warns(UserWarning, match=f"Stopped by SIGTERM; {found}"),
+        pytest.warns(UserWarning, match="after 31 steps could not be written to .*RuntimeError: nothing to note.* is lost"),
+        pytest.raises(SystemExit, match="143"),
+    ):
+        model.learn(100, callback=ExactCheckpointCallback(tmp_path, every=every, notes=notes))

@@ -64,8 +64,16 @@ def test_what_is_another_run_is_refused(tmp_path):
     _recorded(lambda: TwoViewBandit(noise_std=0.3), path)
     with pytest.raises(ValueError, match=r"After 1 steps of each environment the rewards are .*, and were "):
         small_model(TwoViewBandit(noise_std=0.3), AsymmetricSAC, recording=path, seed=1).learn(20)
-    with pytest.raises(ValueError, match="recording ends after 60 steps of each environment"):
-        small_model(TwoViewBandit(noise_std=0.3), AsymmetricSAC, recording=path).learn(61)
+    longer = small_model(TwoViewBandit(noise_std=0.3), AsymmetricSAC, recording=path)
+    with pytest.raises(ValueError, match="recording ends after 60 steps of each environment, and training would end after 61"):
+        longer.learn(61)
+    assert longer.num_timesteps == 0
+    with pytest.raises(ValueError, match="training would end after 80"):
+        longer.learn(40).learn(40, reset_num_timesteps=False)
+    assert longer.learn(20, reset_num_timesteps=False).num_timesteps == 60
+    stepwise = small_model(TwoViewBandit(noise_std=0.3), AsymmetricSAC, recording=path, train_freq=50)
+    with pytest.raises(ValueError, match="recording ends after 60 steps of each environment: train no longer"):
+        stepwise.learn(60)  # its last rollout goes further
     with pytest.raises(ValueError, match="recording is of 1 environments, but the model has 2"):
         small_model(DummyVecEnv([TwoViewBandit] * 2), AsymmetricSAC, recording=path).learn(20)
     with pytest.raises(ValueError, match="recording needs a CompactDictReplayBuffer"):

@@ -1,5 +1,6 @@
 """RMA: SAC with a latent of what is privileged, then an estimate of that latent, from the data of the actor that has it."""
 
+import warnings
 from copy import deepcopy
 
 import gymnasium as gym
@@ -260,6 +261,22 @@ def test_the_expert_collects_and_from_phase_2_on_the_actor(given, ends):
     seen = _steps_of(model, 60)
     assert seen == [(1, "expert")] * ends + [(2, "actor")] * (60 - ends), "in the middle of an episode"
     assert model.policy.roles.behaviour == "expert"
+
+
+def test_a_training_that_ends_in_phase_1_is_warned_of():
+    model = make(TwoViewBandit(length=7), phase_1_steps=30)
+    with pytest.warns(
+        UserWarning, match="RMA ends in phase 1, because phase_1_steps is 30 and training ends after 30 steps"
+    ) as told:
+        model.learn(30)
+    assert [warning.filename for warning in told] == [__file__]
+    assert model.phase == 1
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "RMA ends")
+        model.learn(31)
+        model.learn(5, reset_num_timesteps=False)
+        make(TwoViewBandit(length=7)).learn(30)
+    assert model.phase == 2
 
 
 def test_the_share_is_that_of_the_learn_that_began_to_count():
