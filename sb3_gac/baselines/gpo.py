@@ -87,6 +87,11 @@ class SharedGuider(RoleModel):
         if features_extractor is not None:
             self.privileged = nn.Linear(self.features_dim, learner.net_arch[0], bias=False)
 
+    @property
+    def relation(self) -> tuple[Any, ...]:
+        """The class, since the learner's layers are a part of this network, see :attr:`RoleModel.relation`."""
+        return (type(self).__name__,)
+
     def distribution(self, obs: PyTorchObs) -> Distribution:
         """The guider's action distribution, see :meth:`RolePolicy.distribution`."""
         (learner,) = self._learner
