@@ -182,8 +182,8 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
         entropy = guider.entropy(noise).mean()
         loss = guider_loss + learner_loss - self.ent_coef * entropy + self.vf_coef * value_loss
         kl = guider.detach().kl(learner.detach(), "mean").mean()
-        parts = {"guider_loss": guider_loss, "imitation_loss": learner_loss, "critic_loss": value_loss}
-        return Loss(loss, {**parts, "entropy": entropy, "kl": kl})
+        parts = {"guider_loss": guider_loss, "learner_loss": learner_loss, "critic_loss": value_loss}
+        return Loss(loss, {"loss": loss, **parts, "entropy": entropy, "kl": kl})
 
     @abstractmethod
     def guider_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor, weights: Weights) -> th.Tensor:

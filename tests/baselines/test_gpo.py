@@ -19,6 +19,7 @@ from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice
 
 BOTH = [GPOClip, GPOPenalty]
 OF_POLICY = {"net_arch": [8, 8], "activation_fn": nn.SiLU}
+LOSSES = ("loss", "guider_loss", "learner_loss", "actor_loss", "critic_loss", "entropy")
 
 
 def make_model(env=None, cls=GPOClip, **arguments):
@@ -208,6 +209,16 @@ def test_a_gradient_step_is_that_of_the_papers_one_network(cls):
     others = {"w2": learner.latent_net[2].weight, "v_4_weight": model.policy.critic.value_net[4].weight, **of_heads}
     for name, ours in others.items():
         th.testing.assert_close(ours.grad.double(), plain.named[name].grad, rtol=2e-3, atol=2e-5)
+
+
+@pytest.mark.parametrize("cls", BOTH)
+def test_each_loss_is_logged_under_its_own_name(cls):
+    """As in SB3's PPO, ``loss`` is the sum; the learner's loss has no part in the state value's."""
+    model = make_model(cls=cls, n_epochs=1, vf_coef=0.5, ent_coef=0.01, env=TwoViewBandit(length=3)).learn(16)
+    logged = {name: model.logger.name_to_value[f"train/{name}"] for name in LOSSES}
+    parts = logged["guider_loss"] + logged["learner_loss"] - 0.01 * logged["entropy"] + 0.5 * logged["critic_loss"]
+    assert logged["loss"] == pytest.approx(parts, rel=1e-4, abs=1e-6)
+    assert logged["actor_loss"] == logged["learner_loss"] != logged["loss"]
 
 
 def test_where_both_policies_see_the_same_it_is_ppo_step_for_step():
