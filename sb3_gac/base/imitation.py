@@ -128,9 +128,10 @@ def clone_behaviour(
     Train a model's deployed policy on demonstrations, before ``learn`` (behaviour cloning).
 
     Where actions are continuous, the loss is the squared error of the policy's most likely action; where they are discrete,
-    it is their negative log-likelihood. A Gaussian's standard deviation, the critics and the guider stay as they are, so a
-    residual guider starts at the cloned policy; the policy's target network, if it has one, is the cloned policy too. A tenth
-    of the demonstrations is held out to measure the result.
+    it is their negative log-likelihood. The critics stay as they are. A residual guider starts at the cloned policy, GPO's
+    guider changes with the layers that it shares with the policy, and an independent guider stays as it is. A Gaussian's
+    standard deviation is not fitted, but changes with the hidden layers that it shares with the mean. The policy's target
+    network, if it has one, is the cloned policy too. A tenth of the demonstrations is held out to measure the result.
 
     Critics know nothing of the cloned policy at first, and the policy's first gradient steps in ``learn`` may unlearn what
     was cloned. ``policy_delay``, where it can be set, gives the critics time.

@@ -111,7 +111,7 @@ class GPOPolicy(AsymmetricPolicy):
     One network for learner and guider, and a state-value network. Arguments are those of :class:`AsymmetricPolicy`.
     """
 
-    roles = Roles("learner", actors=("guider",), values=("critic",), collects="guider")
+    roles = Roles("learner", actors=("guider",), values=("critic",), collects="guider", tied=("guider",))
     learner: SharedLearner
     guider: SharedGuider
     critic: StateValue

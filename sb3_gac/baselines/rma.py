@@ -38,7 +38,15 @@ class RMAPolicy(AsymmetricPolicy):
     :param encoder_net_arch: hidden layer sizes of the encoder
     """
 
-    roles = Roles("actor", ("expert",), ("critic",), unprivileged=("critic",), collects="expert", parts=("adaptation",))
+    roles = Roles(
+        "actor",
+        ("expert",),
+        ("critic",),
+        unprivileged=("critic",),
+        collects="expert",
+        parts=("adaptation",),
+        tied=("expert",),
+    )
     actor: Actor
     expert: Actor
     critic: CriticEnsemble

@@ -51,6 +51,20 @@ def test_the_deployed_policy_does_what_it_was_shown_and_nothing_else_moves(env):
     assert all(name.startswith("learner.") and ".log_std." not in name for name in moved)
 
 
+def test_standard_deviations_and_gpos_guider_change_with_the_layers_that_they_share(env):
+    """As the documentation says: neither is fitted, and neither is held."""
+    model = GPOClip("MultiInputPolicy", env, seed=0, **GPO)
+    shown = _made_up(env, lambda partial: 2.0 * np.tanh(partial[:, :1]))
+    observations, _ = model.policy.obs_to_tensor(dict(shown.observations))
+    with th.no_grad():
+        before = [getattr(model.policy, role).distribution(observations) for role in ("learner", "guider")]
+    clone_behaviour(model, shown, gradient_steps=20, batch_size=64, learning_rate=1e-2)
+    with th.no_grad():
+        after = [getattr(model.policy, role).distribution(observations) for role in ("learner", "guider")]
+    assert not th.equal(before[0].log_std, after[0].log_std)
+    assert not th.equal(before[1].mean, after[1].mean)
+
+
 def test_a_residual_guider_starts_at_what_was_cloned(env):
     model = GAC("MultiInputPolicy", env, **SMALL)
     shown = _made_up(env, lambda partial: 2.0 * np.tanh(partial[:, :1]))

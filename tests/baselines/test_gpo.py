@@ -420,6 +420,10 @@ def test_other_environments_in_another_number():
         ({"unroll_length": 0}, "unroll_length must be"),
         ({"clip_range": -0.1}, "clip_range must be"),
         ({"policy_kwargs": {"rnn_type": "gru"}}, "GPOClip has no form with a memory"),
+        (
+            {"policy_kwargs": {"net_arch": {"learner": [8], "guider": [9], "critic": [8]}}},
+            r"net_arch has \['guider'\], whose layers are those of the learner: leave them out",
+        ),
         ({"policy_kwargs": {"net_arch": []}}, "net_arch must have a hidden layer"),
         ({"role_keys": {"guider": ["privileged"]}}, "guider.*lacks"),
     ],
@@ -427,6 +431,11 @@ def test_other_environments_in_another_number():
 def test_what_can_not_be_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         make_model(**arguments)
+
+
+def test_layer_sizes_by_network_are_those_of_the_learner_and_of_the_critic():
+    policy = make_model(policy_kwargs={"net_arch": {"learner": [8], "critic": [5, 4]}}).policy
+    assert (policy.learner.net_arch, policy.guider.net_arch, policy.critic.net_arch) == ([8], [8], [5, 4])
 
 
 def test_what_is_no_argument_is_refused():
