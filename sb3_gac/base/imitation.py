@@ -253,7 +253,8 @@ def _difference(own: nn.Module, other: nn.Module) -> str | None:
 
 def _difference_of_deployed(model: BaseAlgorithm, source: BaseAlgorithm, networks: Mapping[str, str]) -> str | None:
     """What keeps networks relative to the deployed policies from computing the same, and what to do; ``None`` for nothing."""
-    own, other = (one.policy.roles.deployed for one in (model, source))  # type: ignore[union-attr]
+    policies: list[Any] = [model.policy, source.policy]
+    own, other = (policy.roles.deployed for policy in policies)
     if own in networks:
         goes_along = networks[own] == other
     else:
