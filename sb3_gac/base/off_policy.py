@@ -64,7 +64,8 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         observation once, or for recurrent networks its subclass :class:`EpisodeReplayBuffer`
     :param replay_buffer_kwargs: keyword arguments of the replay buffer's class
     :param optimize_memory_usage: argument of replay buffers of other classes, see SB3
-    :param n_steps: number of rewards that a critic's target sums up before it bootstraps
+    :param n_steps: number of rewards that a critic's target sums up before it bootstraps; more than 1 needs a
+        :class:`CompactDictReplayBuffer`, or a class of one's own that takes ``n_steps`` in ``replay_buffer_kwargs``
     :param ent_coef: entropy temperature: "auto" or "auto_<start value>" for a learned one, or a number
     :param target_update_interval: number of gradient steps between two updates of the target networks
     :param target_entropy: entropy that a learned temperature aims at, in nats: "auto", "sac" or a number, see
