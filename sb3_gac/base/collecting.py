@@ -94,7 +94,13 @@ class DataCollection(OffPolicyAlgorithm):
         if reset_num_timesteps:
             self._rollout_steps, self._rollout_episodes = 0, 0
         noise, self._resumed_noise = deepcopy(self._resumed_noise), None
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
+        optimizes = self.optimize_memory_usage
+        if isinstance(self.replay_buffer, CompactDictReplayBuffer):
+            self.optimize_memory_usage = False  # or SB3 ends the last episode in its own arrays; cut_episodes() does it here
+        try:
+            result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
+        finally:
+            self.optimize_memory_usage = optimizes
         if noise is not None and not reset_num_timesteps:
             self.action_noise = noise
         return result

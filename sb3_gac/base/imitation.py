@@ -85,9 +85,9 @@ def demonstrate(
         than ``env`` gives
     """
     check_integer("n_steps", n_steps, 1)
-    _check_scale("teacher", teacher, env, guides=hasattr(teacher, "predict_guider"))
+    _check_scale("teacher", teacher, env, _entries_seen(teacher, guides=hasattr(teacher, "predict_guider")))
     if student is not None:
-        _check_scale("student", student, env)
+        _check_scale("student", student, env, _entries_seen(student))
     show: Any = getattr(teacher, "predict_guider", teacher.predict)
     seen: list[Mapping[str, np.ndarray]] = []
     shown: list[np.ndarray] = []
@@ -104,11 +104,14 @@ def demonstrate(
     return Demonstrations({key: np.concatenate([row[key] for row in seen]) for key in seen[0]}, np.concatenate(shown))
 
 
-def _check_scale(name: str, model: BaseAlgorithm, env: VecEnv, guides: bool = False) -> None:
+def _entries_seen(model: BaseAlgorithm, guides: bool = False) -> list[str]:
     policy: Any = model.policy
-    entries = list(policy.observation_space.spaces)
     if isinstance(policy, AsymmetricPolicy):
-        entries = list(policy.role_keys[policy.roles.behaviour] if guides else policy.deployed_entries)
+        return list(policy.role_keys[policy.roles.behaviour] if guides else policy.deployed_entries)
+    return list(policy.observation_space.spaces)
+
+
+def _check_scale(name: str, model: BaseAlgorithm, env: VecEnv, entries: list[str]) -> None:
     check_same_scale(name, entries, entries_normalised_in_training(model), env)
     check_same_statistics(name, entries, scales_in_training(model), env)
 
@@ -125,9 +128,10 @@ def clone_behaviour(
     Train a model's deployed policy on demonstrations, before ``learn`` (behaviour cloning).
 
     Where actions are continuous, the loss is the squared error of the policy's most likely action; where they are discrete,
-    it is their negative log-likelihood. A Gaussian's standard deviation, the critics and the guider stay as they are, so a
-    residual guider starts at the cloned policy; the policy's target network, if it has one, is the cloned policy too. A tenth
-    of the demonstrations is held out to measure the result.
+    it is their negative log-likelihood. The critics stay as they are. A residual guider starts at the cloned policy, GPO's
+    guider changes with the layers that it shares with the policy, and an independent guider stays as it is. A Gaussian's
+    standard deviation is not fitted, but changes with the hidden layers that it shares with the mean. The policy's target
+    network, if it has one, is the cloned policy too. A tenth of the demonstrations is held out to measure the result.
 
     Critics know nothing of the cloned policy at first, and the policy's first gradient steps in ``learn`` may unlearn what
     was cloned. ``policy_delay``, where it can be set, gives the critics time.
@@ -175,23 +179,32 @@ def copy_networks(model: BaseAlgorithm, source: BaseAlgorithm, networks: Mapping
     """
     Copy the parameters of another model's networks into a model's own networks and their targets.
 
+    A guider that is relative to the learner, as GAC's default one is, stands for a guider of its own kind alone, and goes with
+    its learner: ``{"learner": "learner", "guider": "guider"}``.
+
     :param model: model of this package, whose networks are changed
     :param source: model of this package, whose networks have the same sizes and read the same entries
     :param networks: network of ``model`` -> network of ``source``, such as ``{"guider": "actor"}``
     :raises ValueError: if there is no such network, or it would compute something else: its parameters are of other shapes,
-        or it has another activation, other bounds of its standard deviation, or reads other entries
+        it has another activation, other bounds of its standard deviation, or reads other entries; it is relative to another
+        policy; its actions have another range; or the model's environments normalise its entries in another way
     """
+    if model.action_space != source.action_space:
+        raise ValueError(
+            f"source was trained for actions in {source.action_space}, and the model's are in {model.action_space}: copy "
+            "networks of a model with the same actions."
+        )
     for name, from_name in networks.items():
         own, other = (_network(one, role) for one, role in ((model, name), (source, from_name)))
-        saved, expected = _made_of(other), _made_of(own)
-        differ = [key for key in {**expected, **saved} if saved.get(key, "missing") != expected.get(key, "missing")]
-        if differ:
-            key = differ[0]
+        fault = _difference(own, other)
+        if fault is None and getattr(own, "relation", None):
+            fault = _difference_of_deployed(model, source, networks)
+        if fault is not None:
             raise ValueError(
-                f'networks: "{from_name}" of {type(source).__name__} does not fit "{name}" of {type(model).__name__}: {key} '
-                f"is {saved.get(key, 'missing')} there, and {expected.get(key, 'missing')} here. Make both with the same "
-                "policy_kwargs, on the same entries."
+                f'networks: "{from_name}" of {type(source).__name__} does not fit "{name}" of {type(model).__name__}: {fault}'
             )
+        if model.env is not None:
+            _check_scale("source", source, model.env, [key for key, _ in _entries_of(other)])
     for name, from_name in networks.items():
         parameters = _network(source, from_name).state_dict()
         network = _network(model, name)
@@ -212,11 +225,47 @@ def _reset_targets(policy: AsymmetricPolicy, changed: nn.Module) -> None:
 
 def _network(model: BaseAlgorithm, name: str) -> nn.Module:
     policy = model.policy
-    roles = list(policy.roles.all) if isinstance(policy, AsymmetricPolicy) else []
+    roles = list(policy.roles.networks) if isinstance(policy, AsymmetricPolicy) else []
     network = getattr(policy, name, None) if name in roles else None
     if network is None:
         raise ValueError(f"networks: {type(model).__name__} has no network {name!r}; it has {roles}.")
     return network
+
+
+def _difference(own: nn.Module, other: nn.Module) -> str | None:
+    """What keeps a network's parameters from computing the same in another network, and what to do; ``None`` for nothing."""
+    relation, expected = (getattr(one, "relation", None) for one in (other, own))
+    if relation != expected:
+        kinds = [
+            f"relative to the deployed policy, {kind}" if kind else "a policy of its own" for kind in (relation, expected)
+        ]
+        return (
+            f"it is {kinds[0]} there, and {kinds[1]} here. Make both models with the same kind of guider, or clone the "
+            "teacher by clone_behaviour(), from which a residual guider starts."
+        )
+    saved, needed = _made_of(other), _made_of(own)
+    differ = [key for key in {**needed, **saved} if saved.get(key, "missing") != needed.get(key, "missing")]
+    if not differ:
+        return None
+    there, here = (made_of.get(differ[0], "missing") for made_of in (saved, needed))
+    return f"{differ[0]} is {there} there, and {here} here. Make both with the same policy_kwargs, on the same entries."
+
+
+def _difference_of_deployed(model: BaseAlgorithm, source: BaseAlgorithm, networks: Mapping[str, str]) -> str | None:
+    """What keeps networks relative to the deployed policies from computing the same, and what to do; ``None`` for nothing."""
+    policies: list[Any] = [model.policy, source.policy]
+    own, other = (policy.roles.deployed for policy in policies)
+    if own in networks:
+        goes_along = networks[own] == other
+    else:
+        present, saved = (_network(one, name) for one, name in ((model, own), (source, other)))
+        values, expected = present.state_dict(), saved.state_dict()
+        goes_along = _difference(present, saved) is None and all(
+            values[key].equal(expected[key].to(values[key])) for key in values
+        )
+    if goes_along:
+        return None
+    return f'it is relative to the "{other}" there. Copy that too, by "{own}": "{other}" in networks.'
 
 
 def _made_of(network: Any) -> dict[str, Any]:

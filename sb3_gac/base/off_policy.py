@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from typing_extensions import Self, Unpack
 
@@ -36,7 +37,7 @@ from sb3_gac.checks.requirements import (
 from sb3_gac.networks.heads import resolve_target_entropy
 from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
-from sb3_gac.replay.episodes import EpisodeReplayBuffer
+from sb3_gac.replay.episodes import holds_a_batch
 
 ENT_COEF_START = 0.1
 _EPISODE = 1_000
@@ -70,7 +71,8 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         observation once, or for recurrent networks its subclass :class:`EpisodeReplayBuffer`
     :param replay_buffer_kwargs: keyword arguments of the replay buffer's class
     :param optimize_memory_usage: argument of replay buffers of other classes, see SB3
-    :param n_steps: number of rewards that a critic's target sums up before it bootstraps
+    :param n_steps: number of rewards that a critic's target sums up before it bootstraps; more than 1 needs a
+        :class:`CompactDictReplayBuffer`, or a class of one's own that takes ``n_steps`` in ``replay_buffer_kwargs``
     :param ent_coef: entropy temperature: "auto" or "auto_<start value>" for a learned one, or a number
     :param target_update_interval: number of gradient steps between two updates of the target networks
     :param target_entropy: entropy that a learned temperature aims at, in nats: "auto", "sac" or a number, see
@@ -172,8 +174,7 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         if self.replay_buffer is None and self.env is not None:  # a model without environments only acts, and needs no buffer
             self.replay_buffer = self._make_replay_buffer()
         as_given = {name: getattr(self, name) for name in ("n_steps", "replay_buffer")}
-        if issubclass(self.replay_buffer_class, CompactDictReplayBuffer):
-            self.n_steps = 1  # SB3 warns that it can't pass n_steps on to this buffer, which has it already
+        self.n_steps = 1  # SB3 warns that it can't pass n_steps on to a buffer of a given class, which has it already
         if self.replay_buffer is None:
             self.replay_buffer = object()  # type: ignore[assignment]  # SB3 would make one
         return as_given
@@ -184,6 +185,9 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         check_action_noise(self.action_noise, self.action_space)
         assert isinstance(self.observation_space, spaces.Dict)
         check_held_by(self.replay_buffer_class, self.observation_space, CompactDictReplayBuffer)
+        self.check_samples_from(self.replay_buffer_class)
+        if isinstance(self.replay_buffer, ReplayBuffer):  # which may have been loaded, and be of another class
+            self.check_samples_from(type(self.replay_buffer))
         self._check_replay_buffer_kwargs()
         check_goals(self.replay_buffer_class, self.observation_space, self.env)
         roles = self.policy_class.roles
@@ -193,7 +197,6 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         if self.recording is not None and not issubclass(self._present_buffer_class, CompactDictReplayBuffer):
             raise ValueError("recording needs a CompactDictReplayBuffer: leave replay_buffer_class out.")
         self._make_behaviour()
-        self.check_samples_from(self.replay_buffer_class)
         self.target_entropy = resolve_target_entropy(self.target_entropy, self.action_space)
 
     def check_fixed_arguments(self, given: dict[str, Any], before: dict[str, Any]) -> None:
@@ -347,11 +350,12 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
     def _waits_for_an_episode(self) -> bool:
         """Whether there is no whole episode to learn from yet, with a warning. (In a full buffer, that is an error.)"""
         buffer = self.replay_buffer
-        waits = isinstance(buffer, EpisodeReplayBuffer) and not buffer.full and buffer.n_episodes == 0
+        assert buffer is not None
+        waits = buffer.size() > 0 and not buffer.full and not holds_a_batch(buffer)
         if waits and not self._waiting:
             warnings.warn(
                 "There are no gradient steps until the first episode has ended, although "
-                f"learning_starts={self.learning_starts} is over: a recurrent policy learns from whole episodes.",
+                f"learning_starts={self.learning_starts} is over: {type(buffer).__name__} samples whole episodes.",
                 stacklevel=3,
             )
         self._waiting = waits

@@ -2,6 +2,7 @@
 
 import inspect
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,6 +11,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_gac.checkpoint.rows import SavedBlocks, read_rows, write_rows
+from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.checks.policy import check_taken
 from sb3_gac.checks.spaces import check_spaces_of
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
@@ -65,6 +67,7 @@ class ReplayData(OffPolicyAlgorithm):
         """
         if self.is_recurrent:
             check_learns_from_sequences(replay_buffer_class, self.n_steps)
+        check_sums_rewards(replay_buffer_class or self._present_buffer_class, self.n_steps, self.replay_buffer_kwargs)
         if self.samples_histories:
             check_samples_histories(replay_buffer_class)
 
@@ -105,10 +108,26 @@ class ReplayData(OffPolicyAlgorithm):
         assert loaded is not None
         check_spaces_of(self, loaded, "replay buffer")
         self.check_samples_from(type(loaded))
+        self._check_has_options(loaded)
         if self.env is not None:
             check_number(loaded, self.n_envs)
         self.replay_buffer = loaded
         self._set_sampling_options(loaded)
+
+    def _check_has_options(self, buffer: ReplayBuffer) -> None:
+        """
+        Check that a loaded buffer is sampled as the model's arguments say.
+
+        :raises ValueError: naming an option that the buffer does not have
+        """
+        for name in SAMPLING_OPTIONS:
+            value = self.replay_buffer_kwargs.get(name)
+            if name not in ("n_steps", "gamma") and value and not hasattr(buffer, name):
+                raise ValueError(
+                    f"The model has replay_buffer_kwargs with {name}={value}, but the replay buffer is a "
+                    f"{type(buffer).__name__}, which can't be sampled so: load a buffer of another class, or make the model "
+                    f"without {name}."
+                )
 
     def _set_sampling_options(self, buffer: ReplayBuffer) -> None:
         """Have the model's arguments say how one of this package's buffers is sampled."""
@@ -214,6 +233,26 @@ class ReplayData(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_saved_blocks", "_replay_source"]
+
+
+def check_sums_rewards(buffer_class: type[ReplayBuffer], n_steps: int, options: Mapping[str, Any]) -> None:
+    """
+    Check that a class of replay buffers sums up as many rewards as a critic's target is to have.
+
+    :param buffer_class: class of the replay buffer; one of neither this package nor SB3 may have an option ``n_steps``
+    :param n_steps: number of rewards summed up
+    :param options: keyword arguments of the class
+    :raises ValueError: if the class sums up none
+    """
+    if issubclass(buffer_class, CompactDictReplayBuffer):
+        sums = not issubclass(buffer_class, EpisodeReplayBuffer)
+    else:
+        sums = "n_steps" in options and "n_steps" in constructor_parameters(buffer_class)
+    if n_steps > 1 and not sums:
+        raise ValueError(
+            f"n_steps={n_steps} needs a replay buffer that sums up rewards, which {buffer_class.__name__} does not: leave "
+            "n_steps at 1, or use CompactDictReplayBuffer, the default of policies without a memory."
+        )
 
 
 def _default(buffer_class: type, option: str) -> Any:

@@ -31,6 +31,7 @@ class Roles(NamedTuple):
     :param values: state-value networks, without target networks
     :param collects: policy that acts in training; ``None`` for the deployed one
     :param parts: parts of networks that have an optimiser of their own, each an attribute of the policy
+    :param tied: those of the other policies whose hidden layers are the deployed policy's
     """
 
     deployed: str
@@ -41,6 +42,7 @@ class Roles(NamedTuple):
     values: tuple[str, ...] = ()
     collects: str | None = None
     parts: tuple[str, ...] = ()
+    tied: tuple[str, ...] = ()
 
     @property
     def policies(self) -> tuple[str, ...]:
@@ -140,15 +142,17 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
 
     :param roles: roles of the algorithm
     :param net_arch: one list of sizes for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each policy and
-        one for "critic"
+        one for "critic"; policies whose layers are the deployed one's have no list
     :return: role -> list of sizes, for all networks
     :raises ValueError: if ``net_arch`` has none of these forms, or a size is no integer above 0
     """
-    policies = roles.policies
+    policies = tuple(role for role in roles.policies if role not in roles.tied)
     if isinstance(net_arch, list):
         net_arch = {**dict.fromkeys(policies, net_arch), CRITICS: net_arch}
     if isinstance(net_arch, Mapping) and set(net_arch) == {"pi", "qf"}:
         net_arch = {**dict.fromkeys(policies, net_arch["pi"]), CRITICS: net_arch["qf"]}
+    if isinstance(net_arch, Mapping) and (needless := sorted(set(net_arch) & set(roles.tied))):
+        raise ValueError(f"net_arch has {needless}, whose layers are those of the {roles.deployed}: leave them out.")
     if not isinstance(net_arch, Mapping) or set(net_arch) != {*policies, CRITICS}:
         raise ValueError(
             f'net_arch must be a list, {{"pi": [...], "qf": [...]}} or one list for each of {[*policies, CRITICS]}, '
@@ -157,7 +161,8 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
     for sizes in net_arch.values():
         for size in sizes:
             check_integer("net_arch: a layer's size", size, 1)
-    return {role: net_arch[role if role in policies else CRITICS] for role in roles.networks}
+    sizes_of = dict.fromkeys(roles.networks, net_arch[CRITICS]) | dict.fromkeys(roles.tied, net_arch[roles.deployed])
+    return sizes_of | {role: net_arch[role] for role in policies}
 
 
 def resolve_lr_scales(roles: Roles, lr_scales: Mapping[str, float] | None) -> dict[str, float]:

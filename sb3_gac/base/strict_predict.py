@@ -86,7 +86,8 @@ class DeploymentGuard(BaseAlgorithm):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        The deployed policy's action.
+        The deployed policy's action. The observation is taken as it is: a model that learned under ``VecNormalize`` needs a
+        normalised one, as ``vec_normalize.normalize_obs(observation)`` or normalised environments give it.
 
         :param observation: one observation or a batch: a dict, or the array of the one entry that the policy reads
         :param state: state that the last call returned, for a recurrent policy; ``None`` at the start

@@ -87,6 +87,11 @@ class SharedGuider(RoleModel):
         if features_extractor is not None:
             self.privileged = nn.Linear(self.features_dim, learner.net_arch[0], bias=False)
 
+    @property
+    def relation(self) -> tuple[Any, ...]:
+        """The class, since the learner's layers are a part of this network, see :attr:`RoleModel.relation`."""
+        return (type(self).__name__,)
+
     def distribution(self, obs: PyTorchObs) -> Distribution:
         """The guider's action distribution, see :meth:`RolePolicy.distribution`."""
         (learner,) = self._learner
@@ -106,7 +111,7 @@ class GPOPolicy(AsymmetricPolicy):
     One network for learner and guider, and a state-value network. Arguments are those of :class:`AsymmetricPolicy`.
     """
 
-    roles = Roles("learner", actors=("guider",), values=("critic",), collects="guider")
+    roles = Roles("learner", actors=("guider",), values=("critic",), collects="guider", tied=("guider",))
     learner: SharedLearner
     guider: SharedGuider
     critic: StateValue
@@ -177,8 +182,8 @@ class GPO(GuiderPrediction, AsymmetricOnPolicyAlgorithm):  # type: ignore[misc]
         entropy = guider.entropy(noise).mean()
         loss = guider_loss + learner_loss - self.ent_coef * entropy + self.vf_coef * value_loss
         kl = guider.detach().kl(learner.detach(), "mean").mean()
-        parts = {"guider_loss": guider_loss, "imitation_loss": learner_loss, "critic_loss": value_loss}
-        return Loss(loss, {**parts, "entropy": entropy, "kl": kl})
+        parts = {"guider_loss": guider_loss, "learner_loss": learner_loss, "critic_loss": value_loss}
+        return Loss(loss, {"loss": loss, **parts, "entropy": entropy, "kl": kl})
 
     @abstractmethod
     def guider_objective(self, batch: Samples, guider: Any, learner: Any, epsilon: th.Tensor, weights: Weights) -> th.Tensor:

@@ -39,7 +39,9 @@ class RMAPolicy(AsymmetricPolicy):
     :param encoder_net_arch: hidden layer sizes of the encoder
     """
 
-    roles = Roles("actor", ("expert",), ("critic",), unprivileged=("critic",), collects="expert", parts=("adaptation",))
+    roles = Roles(
+        "actor", ("expert",), ("critic",), unprivileged=("critic",), collects="expert", parts=("adaptation",), tied=("expert",)
+    )
     actor: Actor
     expert: Actor
     critic: CriticEnsemble
@@ -181,8 +183,7 @@ class RMA(AsymmetricOffPolicyAlgorithm):
         noise = th.randn((2, *batch.actions.shape), device=self.device)
         metrics = self.minimize(("critic", "expert"), self.critic_loss, batch, noise[0], beta)
         metrics |= self.minimize(("actor", "expert"), self.actor_loss, batch, noise[1], beta)
-        metrics |= ent_coef.update(float(self.target_entropy) - metrics["entropy"])
-        return metrics | self.coefficient_values()
+        return metrics | ent_coef.update(float(self.target_entropy) - metrics["entropy"]) | self.coefficient_values()
 
     def critic_loss(self, batch: Batch, noise: th.Tensor, beta: th.Tensor) -> Loss:
         """The critics, with their encoder of z, fit the expert's return and entropy."""

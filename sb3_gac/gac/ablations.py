@@ -1,5 +1,6 @@
 """The paper's ablations of the learner's objective (its Figure 6)."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch as th
@@ -15,6 +16,18 @@ class GACShare(GAC):
 
     ``learner_kl_scale="auto"`` is 1 with every kind of guider, since the ablation is about the pull of that term.
     """
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        by_role = {name: getattr(self, name) for name in ("update_every", "lr_scales", "role_keys")} | (
+            self.policy_kwargs or {}
+        )
+        for name, value in by_role.items():
+            if isinstance(value, Mapping) and "learner_critic" in value:
+                raise ValueError(
+                    f'{name} names "learner_critic", which {type(self).__name__} does not have: leave it out, since the '
+                    "learner has no critics of its own."
+                )
 
     def _auto_learner_kl_weight(self) -> float:
         return 1.0

@@ -81,6 +81,11 @@ class Guider(RolePolicy):
         self.max_kl = max_kl
         self.kl_reduction = kl_reduction
 
+    @property
+    def relation(self) -> tuple[Any, ...] | None:
+        """The hard bound, which depends on the learner, see :attr:`RoleModel.relation`."""
+        return None if self.max_kl is None else (type(self).__name__, self.max_kl, self.kl_reduction)
+
     def relative_to(self, learner: Any, output: Any) -> Distribution:
         """
         The guider's action distribution, given the learner's.
@@ -119,6 +124,11 @@ class ResidualGuider(Guider):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.head.shrink(DELTA_INIT_SCALE)
+
+    @property
+    def relation(self) -> tuple[Any, ...]:
+        """The correction's class and hard bound, see :attr:`RoleModel.relation`."""
+        return type(self).__name__, self.max_kl, self.kl_reduction
 
     def relative_to(self, learner: Any, output: Any) -> Distribution:
         """The learner moved by the correction, see :meth:`Guider.relative_to`."""

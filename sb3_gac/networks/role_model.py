@@ -61,6 +61,14 @@ class RoleModel(BaseModel):
         self.rest_extractor = rest_extractor
         self.memory = memory
 
+    @property
+    def relation(self) -> tuple[Any, ...] | None:
+        """
+        What makes the output relative to the deployed policy, which is a part of what it means; ``None`` for an output that
+        stands by itself.
+        """
+        return None
+
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         """
         The features of an observation.

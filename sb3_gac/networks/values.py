@@ -7,6 +7,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_gac.networks.layers import Head
 from sb3_gac.networks.role_model import RoleModel
 
 
@@ -15,7 +16,9 @@ class StateValue(RoleModel):
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.value_net = nn.Sequential(*create_mlp(self.features_dim, 1, self.net_arch, self.activation_fn))
+        hidden = create_mlp(self.features_dim, -1, self.net_arch, self.activation_fn)
+        latent_dim = self.net_arch[-1] if self.net_arch else self.features_dim
+        self.value_net = nn.Sequential(*hidden, Head(latent_dim, 1))
 
     def forward(self, obs: PyTorchObs) -> th.Tensor:
         r"""

@@ -12,7 +12,7 @@ DONE, TIME_LIMIT, CUT = 1, 2, 4
 
 
 class ShownByStep(DictReplayBuffer):
-    """A replay buffer whose arrays are put together at each access."""
+    """A replay buffer whose arrays are put together at each access, and can't be written to: the writing would be lost."""
 
     n_rows: int
     layout: ObservationLayout
@@ -32,14 +32,20 @@ class ShownByStep(DictReplayBuffer):
 
     def _everywhere(self, gather: Callable[[np.ndarray, np.ndarray], Rows]) -> dict[str, np.ndarray]:
         packed = gather(*np.divmod(np.arange(self.n_rows * self.n_envs), self.n_envs))
-        return self.layout.unpack({group: values.reshape(*self.endings.shape, -1) for group, values in packed.items()})
+        shown = self.layout.unpack({group: values.reshape(*self.endings.shape, -1) for group, values in packed.items()})
+        return {key: _read_only(values) for key, values in shown.items()}
 
     @property
     def dones(self) -> np.ndarray:  # type: ignore[override]
         """1 where an episode ended by termination or time limit, else 0, shape (rows, n_envs)."""
-        return (self.endings & DONE).astype(np.float32)
+        return _read_only((self.endings & DONE).astype(np.float32))
 
     @property
     def timeouts(self) -> np.ndarray:  # type: ignore[override]
         """1 where an episode ended by its time limit, else 0, shape (rows, n_envs)."""
-        return (self.endings & TIME_LIMIT > 0).astype(np.float32)
+        return _read_only((self.endings & TIME_LIMIT > 0).astype(np.float32))
+
+
+def _read_only(values: np.ndarray) -> np.ndarray:
+    values.flags.writeable = False
+    return values

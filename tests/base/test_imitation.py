@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_gac import GAC, AsymmetricMPO, AsymmetricSAC, clone_behaviour, copy_networks, demonstrate
+from sb3_gac import GAC, AsymmetricMPO, AsymmetricSAC, GPOClip, clone_behaviour, copy_networks, demonstrate
 from sb3_gac.base.imitation import Demonstrations
 from sb3_gac.envs import make_vec
 from sb3_gac.networks.encoders import VectorExtractor
 from tests.helpers import TwoViewBandit, small_model
 
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "buffer_size": 500, "learning_starts": 20, "seed": 0}
+GPO = {"policy_kwargs": {"net_arch": [16]}}
 FULL = {"role_keys": {"actor": ["partial", "privileged"]}}
 
 
@@ -47,6 +49,20 @@ def test_the_deployed_policy_does_what_it_was_shown_and_nothing_else_moves(env):
     moved = {name for name, value in model.policy.state_dict().items() if not th.equal(value, before[name])}
     assert moved
     assert all(name.startswith("learner.") and ".log_std." not in name for name in moved)
+
+
+def test_standard_deviations_and_gpos_guider_change_with_the_layers_that_they_share(env):
+    """As the documentation says: neither is fitted, and neither is held."""
+    model = GPOClip("MultiInputPolicy", env, seed=0, **GPO)
+    shown = _made_up(env, lambda partial: 2.0 * np.tanh(partial[:, :1]))
+    observations, _ = model.policy.obs_to_tensor(dict(shown.observations))
+    with th.no_grad():
+        before = [getattr(model.policy, role).distribution(observations) for role in ("learner", "guider")]
+    clone_behaviour(model, shown, gradient_steps=20, batch_size=64, learning_rate=1e-2)
+    with th.no_grad():
+        after = [getattr(model.policy, role).distribution(observations) for role in ("learner", "guider")]
+    assert not th.equal(before[0].log_std, after[0].log_std)
+    assert not th.equal(before[1].mean, after[1].mean)
 
 
 def test_a_residual_guider_starts_at_what_was_cloned(env):
@@ -240,6 +256,46 @@ def test_networks_that_do_not_fit_are_refused_and_nothing_is_copied(env):
     with pytest.raises(ValueError, match=r"networks: GAC has no network 'actor'; it has \['learner'"):
         copy_networks(model, teacher, {"actor": "actor"})
     assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+
+
+@pytest.mark.parametrize("guider", ["residual", "lagged"])
+def test_a_policy_of_its_own_and_a_correction_of_the_learner_are_not_taken_for_each_other(env, guider):
+    """All shapes fit: the mean of one would become the other's distance from the learner."""
+    teacher = AsymmetricSAC("MultiInputPolicy", env, **SMALL, **FULL)
+    model = GAC("MultiInputPolicy", env, guider=guider, **SMALL | {"seed": 1})
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    with pytest.raises(ValueError, match=r"it is a policy of its own there, and relative to the deployed policy, .* here"):
+        copy_networks(model, teacher, {"guider": "actor"})
+    with pytest.raises(ValueError, match=r"it is relative to the deployed policy, .* there, and a policy of its own here"):
+        copy_networks(teacher, model, {"actor": "guider"})
+    assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+
+
+@pytest.mark.parametrize("arguments", [{}, {"guider": "lagged"}, {"guider": "independent", "max_kl": 0.1}, GPOClip], ids=str)
+def test_a_guider_relative_to_its_learner_is_copied_with_the_learner_alone(env, arguments):
+    cls, arguments = (GAC, SMALL | arguments) if isinstance(arguments, dict) else (arguments, GPO)
+    source, model = (cls("MultiInputPolicy", env, **arguments | {"seed": seed}) for seed in (0, 1))
+    with pytest.raises(ValueError, match=r'relative to the "learner" there. Copy that too, by "learner": "learner"'):
+        copy_networks(model, source, {"guider": "guider"})
+    copy_networks(model, source, {"guider": "guider", "learner": "learner"})
+    observation = env.reset()
+    copied, expected = (one.predict_guider(observation, deterministic=True)[0] for one in (model, source))
+    np.testing.assert_allclose(copied, expected, rtol=1e-6)
+    copy_networks(model, source, {"guider": "guider"})  # the learners are equal by now
+
+
+def test_networks_for_actions_of_another_range_are_refused():
+    source, model = (GAC("MultiInputPolicy", TwoViewBandit(), guider="independent", **SMALL) for _ in range(2))
+    model.action_space = spaces.Box(-20, 20, (1,), np.float32)
+    with pytest.raises(ValueError, match=r"source was trained for actions in Box\(-1.* the model's are in Box\(-20"):
+        copy_networks(model, source, {"learner": "learner"})
+
+
+def test_networks_that_learned_on_another_scale_are_refused():
+    source = small_model(VecNormalize(DummyVecEnv([TwoViewBandit]))).learn(20)
+    with pytest.raises(ValueError, match=r'source was trained on an entry "partial" that was normalised .* env gives it raw'):
+        copy_networks(small_model(), source, {"learner": "learner"})
+    copy_networks(small_model(source.get_env()), source, {"learner": "learner"})
 
 
 @pytest.mark.parametrize("name", ["AsymmetricMPO", "COSIL", "GACWithoutQ", "GPOPenalty", "RMA", "TGRL"])

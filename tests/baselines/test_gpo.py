@@ -19,6 +19,7 @@ from tests.helpers import Sampled, TwoViewBandit, TwoViewChoice
 
 BOTH = [GPOClip, GPOPenalty]
 OF_POLICY = {"net_arch": [8, 8], "activation_fn": nn.SiLU}
+LOSSES = ("loss", "guider_loss", "learner_loss", "actor_loss", "critic_loss", "entropy")
 
 
 def make_model(env=None, cls=GPOClip, **arguments):
@@ -208,6 +209,16 @@ def test_a_gradient_step_is_that_of_the_papers_one_network(cls):
     others = {"w2": learner.latent_net[2].weight, "v_4_weight": model.policy.critic.value_net[4].weight, **of_heads}
     for name, ours in others.items():
         th.testing.assert_close(ours.grad.double(), plain.named[name].grad, rtol=2e-3, atol=2e-5)
+
+
+@pytest.mark.parametrize("cls", BOTH)
+def test_each_loss_is_logged_under_its_own_name(cls):
+    """As in SB3's PPO, ``loss`` is the sum; the learner's loss has no part in the state value's."""
+    model = make_model(cls=cls, n_epochs=1, vf_coef=0.5, ent_coef=0.01, env=TwoViewBandit(length=3)).learn(16)
+    logged = {name: model.logger.name_to_value[f"train/{name}"] for name in LOSSES}
+    parts = logged["guider_loss"] + logged["learner_loss"] - 0.01 * logged["entropy"] + 0.5 * logged["critic_loss"]
+    assert logged["loss"] == pytest.approx(parts, rel=1e-4, abs=1e-6)
+    assert logged["actor_loss"] == logged["learner_loss"] != logged["loss"]
 
 
 def test_where_both_policies_see_the_same_it_is_ppo_step_for_step():
@@ -409,6 +420,10 @@ def test_other_environments_in_another_number():
         ({"unroll_length": 0}, "unroll_length must be"),
         ({"clip_range": -0.1}, "clip_range must be"),
         ({"policy_kwargs": {"rnn_type": "gru"}}, "GPOClip has no form with a memory"),
+        (
+            {"policy_kwargs": {"net_arch": {"learner": [8], "guider": [9], "critic": [8]}}},
+            r"net_arch has \['guider'\], whose layers are those of the learner: leave them out",
+        ),
         ({"policy_kwargs": {"net_arch": []}}, "net_arch must have a hidden layer"),
         ({"role_keys": {"guider": ["privileged"]}}, "guider.*lacks"),
     ],
@@ -416,6 +431,11 @@ def test_other_environments_in_another_number():
 def test_what_can_not_be_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         make_model(**arguments)
+
+
+def test_layer_sizes_by_network_are_those_of_the_learner_and_of_the_critic():
+    policy = make_model(policy_kwargs={"net_arch": {"learner": [8], "critic": [5, 4]}}).policy
+    assert (policy.learner.net_arch, policy.guider.net_arch, policy.critic.net_arch) == ([8], [8], [5, 4])
 
 
 def test_what_is_no_argument_is_refused():

@@ -327,6 +327,21 @@ def test_role_keys_are_named_as_they_were_written(cls, keys):
         small_model(cls=cls, role_keys={role: ["partial"] for role in roles} | {"critic": keys})
 
 
+@pytest.mark.parametrize("cls", [GACShare, GACWithoutQ])
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("update_every", {"update_every": {"learner_critic": 2}}),
+        ("lr_scales", {"lr_scales": {"learner_critic": 2.0}}),
+        ("role_keys", {"role_keys": {"learner_critic": ["privileged"]}}),
+        ("rnn_type", {"policy_kwargs": {"rnn_type": {"learner_critic": "gru"}}}),
+    ],
+)
+def test_settings_of_critics_that_an_ablation_does_without_are_refused(cls, name, arguments):
+    with pytest.raises(ValueError, match=f'{name} names "learner_critic", which {cls.__name__} does not have'):
+        small_model(cls=cls, **arguments)
+
+
 def test_guider_alone_is_refused_with_a_pointer():
     with pytest.raises(TypeError, match=r"GAC\.predict_guider"):
         small_model().policy.guider.predict(TwoViewBandit().reset(seed=0)[0])

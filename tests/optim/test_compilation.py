@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from torch._dynamo.backends.debugging import aot_eager
 
-from sb3_gac import COSIL, GAC, RMA, AsymmetricMPO, AsymmetricSAC
+from sb3_gac import COSIL, GAC, RMA, AsymmetricMPO, AsymmetricSAC, GPOClip
 from sb3_gac.optim.compile import Program
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
 from tests.registry import LINES, algorithms, load, make, needed
@@ -214,7 +214,8 @@ def test_mixed_precision_is_near_full_precision_and_keeps_parameters_and_heads_i
 def test_mixed_precision_leaves_the_last_layers_alone(env):
     policy = small_model(env()).policy
     x = th.randn(2, 5, 16)
-    last = {"actor": next(policy.deployed.head.children()), "critic": policy.critic.output}
+    value = GPOClip("MultiInputPolicy", env(), policy_kwargs={"net_arch": [16]}).policy.critic.value_net[-1]
+    last = {"actor": next(policy.deployed.head.children()), "critic": policy.critic.output, "state value": value}
     for name, layer in last.items():
         plain = layer(x)
         with th.autocast("cpu", th.bfloat16):

@@ -169,6 +169,21 @@ def test_shows_what_sb3s_buffer_shows():
             np.testing.assert_array_equal(getattr(compact, name)[key][:15], getattr(twice, name)[key][:15])
 
 
+@pytest.mark.parametrize("name", ["observations", "next_observations", "dones", "timeouts"])
+def test_arrays_that_are_put_together_can_not_be_written_to(name):
+    """The values written would be in no batch."""
+    buffer = _make(20, 2)
+    feeder = Feeder(buffer, 2)
+    for _ in range(5):
+        feeder.step()
+    shown = getattr(buffer, name)
+    for values in shown.values() if isinstance(shown, dict) else [shown]:
+        with pytest.raises(ValueError, match="read-only"):
+            values[:] = 1
+    buffer.rewards[:] = 7.0
+    assert buffer.sample(4).rewards.unique().tolist() == [7.0]
+
+
 def test_samples_are_uniform_over_steps_and_environments():
     buffer = _make(5, 2)
     feeder = Feeder(buffer, 2)

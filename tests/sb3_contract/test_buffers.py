@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_gac import CompactDictReplayBuffer
+from sb3_gac import CompactDictReplayBuffer, EpisodeReplayBuffer
 from tests.registry import algorithms, make
 from tests.sb3_contract.helpers import pendulum, vectorized
 
@@ -49,6 +50,60 @@ def test_buffer_of_ones_own_is_sampled(algorithm):
     assert model.replay_buffer.scale == 2.0
     assert model.replay_buffer.n_samples == 7 * model._n_updates > 0
     assert model._sample_batch(7).discounts.tolist() == [0.5] * 7
+
+
+@pytest.mark.parametrize("buffer_class", [DictReplayBuffer, HerReplayBuffer, EpisodeReplayBuffer])
+def test_a_buffer_that_sums_up_no_rewards_is_refused_with_n_steps(buffer_class):
+    """SB3 would ignore ``n_steps``, and advise to pass it to the buffer, which has no such argument."""
+    for options in ({}, {"n_steps": 3, "gamma": 0.99}):
+        with pytest.raises(
+            ValueError, match=f"n_steps=3 needs a replay buffer that sums up rewards, which {buffer_class.__name__} do"
+        ):
+            make("gac", pendulum(), n_steps=3, replay_buffer_class=buffer_class, replay_buffer_kwargs=options)
+    model = make("gac", pendulum(), replay_buffer_class=DictReplayBuffer).learn(30)
+    model.n_steps = 3
+    with pytest.raises(ValueError, match="n_steps=3 needs a replay buffer that sums up rewards, which DictReplayBuffer"):
+        model.learn(10, reset_num_timesteps=False)
+    assert model.n_steps == 1
+
+
+class SummingBuffer(OwnBuffer):
+    """With an option of the name that this package's buffers have."""
+
+    def __init__(self, *args, n_steps=1, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.n_steps = n_steps
+
+
+def test_a_buffer_of_ones_own_may_sum_up_rewards(recwarn):
+    model = make("gac", pendulum(), n_steps=3, replay_buffer_class=SummingBuffer, replay_buffer_kwargs={"n_steps": 3})
+    assert model.n_steps == model.replay_buffer.n_steps == 3
+    assert not [warning for warning in recwarn if "n_steps" in str(warning.message)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"n_steps": 3}, "n_steps=3 needs a replay buffer that sums up rewards, which DictReplayBuffer does not"),
+        ({"replay_buffer_kwargs": {"mask_truncations": True}}, "mask_truncations=True, but the replay buffer is a DictReplay"),
+    ],
+)
+def test_a_loaded_buffer_that_can_not_be_sampled_as_told_is_refused(arguments, said, tmp_path):
+    make("gac", pendulum(), replay_buffer_class=DictReplayBuffer).learn(30).save_replay_buffer(tmp_path / "buffer")
+    model = make("gac", pendulum(), **arguments)
+    before = model.replay_buffer
+    with pytest.raises(ValueError, match=said):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is before
+
+
+def test_n_steps_that_a_loaded_buffer_does_not_have_can_not_be_set_later(tmp_path):
+    make("gac", pendulum(), replay_buffer_class=DictReplayBuffer).learn(30).save_replay_buffer(tmp_path / "buffer")
+    model = make("gac", pendulum())
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.n_steps = 3
+    with pytest.raises(ValueError, match="which DictReplayBuffer does not"):
+        model.learn(10, reset_num_timesteps=False)
 
 
 @algorithms("replay")

@@ -50,6 +50,15 @@ def test_goal_environments(algorithm):
     _check_goal_environment(algorithm, image=False)
 
 
+def test_gradient_steps_wait_for_the_first_episode():
+    """The warm-up of four environments ends before any of their episodes does."""
+    goals = make_vec_env(lambda: _env(max_steps=20), n_envs=4)
+    model = _make("gac", goals, learning_starts=8)
+    with pytest.warns(UserWarning, match=r"no gradient steps until .* learning_starts=8 is over: HerReplayBuffer"):
+        model.learn(200)
+    assert model._n_updates > 0
+
+
 @with_goals
 def test_a_goal_that_the_deployed_policy_does_not_read_is_told(algorithm):
     """It would learn what is best on average over goals, and nothing would fail."""
