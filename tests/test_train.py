@@ -448,7 +448,7 @@ def test_evaluations_on_the_way_have_five_episodes_at_most(asked, taken, tmp_pat
 
     monkeypatch.setattr(job, "GuiderLearnerEvalCallback", Noted)
     with pytest.raises((KeyboardInterrupt, SystemExit)):
-        main([*QUICK, "--episodes", str(asked), "--runs", str(tmp_path)])
+        main([*QUICK, "--overrides", "{learning_starts: 50}", "--episodes", str(asked), "--runs", str(tmp_path)])
     assert numbers == [(taken, taken)]
 
 
