@@ -15,8 +15,8 @@ from sb3_gac import ExactCheckpointCallback, SeededEvalCallback
 from sb3_gac.checkpoint.files import checkpoints
 
 CHECKPOINT, TIMING = "checkpoint", "timing.json"
-#: A model, and one row for each of its evaluations so far
-Resumed: TypeAlias = tuple[BaseAlgorithm, list[dict[str, float]]]
+#: A model, and the state of the callback that evaluates it
+Resumed: TypeAlias = tuple[BaseAlgorithm, dict[str, Any]]
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -80,12 +80,12 @@ class ExactCheckpoints:
         :param arguments: arguments that the model was made with
         :param env: environments of the run, made as before
         :param seed: seed of the run
-        :return: model, and its evaluations so far; ``None`` if there is no checkpoint
+        :return: model, and the state of its evaluations so far; ``None`` if there is no checkpoint
         """
         if not checkpoints(self._directory):
             return None
         model = algorithm_class.resume(self._directory, env, device="cpu", **arguments)
-        return model, model.resumed_notes
+        return model, _as_state(model.resumed_notes)
 
     def callback(self, evaluation: SeededEvalCallback, every: int) -> BaseCallback:
         """
@@ -94,7 +94,7 @@ class ExactCheckpoints:
         :return: callback that writes a checkpoint after every evaluation
         """
         # A run that is told to end writes no checkpoint: one between two evaluations would shift the next evaluations
-        return ExactCheckpointCallback(self._directory, every, notes=lambda: _plain(evaluation.history), on_signals=False)
+        return ExactCheckpointCallback(self._directory, every, notes=evaluation.checkpoint_state, on_signals=False)
 
     def remove(self) -> None:
         """Remove all checkpoints, once the run is finished."""
@@ -114,7 +114,7 @@ class SB3Checkpoints(ExactCheckpoints):
                 model = algorithm_class.load(path / "model", env=env, device="cpu")
                 model.load_replay_buffer(path / "replay_buffer.pkl")
                 model.set_random_seed(hash((seed, model.num_timesteps)) % 2**31)
-                return model, json.loads((path / "history.json").read_text())
+                return model, _as_state(json.loads((path / "history.json").read_text()))
         return None
 
     def callback(self, evaluation: SeededEvalCallback, every: int) -> BaseCallback:
@@ -129,13 +129,13 @@ class SB3Checkpoints(ExactCheckpoints):
     def _with(self, suffix: str) -> Path:
         return self._directory.with_name(f"{CHECKPOINT}{suffix}")
 
-    def _save(self, model: Any, history: list[dict[str, float]]) -> None:
+    def _save(self, model: Any, evaluations: dict[str, Any]) -> None:
         current, new, old = (self._with(suffix) for suffix in ("", ".new", ".old"))
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir()
         model.save(new / "model")
         model.save_replay_buffer(new / "replay_buffer.pkl")
-        write_atomically(new / "history.json", json.dumps(_plain(history)))
+        write_atomically(new / "history.json", json.dumps(evaluations))
         shutil.rmtree(old, ignore_errors=True)
         if current.exists():
             current.rename(old)
@@ -148,21 +148,22 @@ class _AfterEvaluation(BaseCallback):
     Saves the model after every evaluation.
 
     :param evaluation: callback that evaluates; it is called before this one
-    :param save: function that saves the model and its evaluations so far
+    :param save: function that saves the model, and the state of its evaluations
     """
 
-    def __init__(self, evaluation: SeededEvalCallback, save: Callable[[Any, list[dict[str, float]]], None]):
+    def __init__(self, evaluation: SeededEvalCallback, save: Callable[[Any, dict[str, Any]], None]):
         super().__init__()
         self._evaluation, self._save = evaluation, save
 
     def _on_step(self) -> bool:
         if self.n_calls % self._evaluation.eval_freq == 0:
-            self._save(self.model, self._evaluation.history)
+            self._save(self.model, self._evaluation.checkpoint_state())
         return True
 
 
-def _plain(history: list[dict[str, float]]) -> list[dict[str, float]]:
-    return [{key: value if isinstance(value, int) else float(value) for key, value in row.items()} for row in history]
+def _as_state(notes: Any) -> dict[str, Any]:
+    """State of the evaluations in a checkpoint, in whose place those of earlier versions have the rows alone."""
+    return {"history": notes} if isinstance(notes, list) else notes
 
 
 def checkpoints_of(algorithm_class: type, directory: Path) -> ExactCheckpoints:

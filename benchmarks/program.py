@@ -42,10 +42,10 @@ def read_rows(directory: Path) -> Rows:
 def rows_as_text(rows: Rows) -> str:
     """
     :param rows: at least one row
-    :return: text of a CSV file with these rows; the columns are those of the last row
+    :return: text of a CSV file with these rows; the columns are those of any row
     """
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, rows[-1].keys(), restval="nan")
+    writer = csv.DictWriter(text, {name: None for row in rows for name in row}, restval="nan")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()

@@ -205,7 +205,8 @@ def _train(
     if resumed is None:
         model = algorithm_class(env=env, device="cpu", **arguments)
     else:
-        model, evaluation.history = resumed
+        model, state = resumed
+        evaluation.restore_checkpoint_state(state)
     model.set_logger(configure(str(directory / "tensorboard"), ["tensorboard"]))
     callbacks = [evaluation, checkpoints.callback(evaluation, every * spec.envs), stopwatch]
     left = spec.steps - model.num_timesteps

@@ -16,7 +16,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_gac.checks.arguments import constructor_arguments
-from sb3_gac.checks.values import described
+from sb3_gac.checks.values import described, plain
 
 #: Argument -> what to do with it where guider and learner are apart
 _ADVICE = {
@@ -113,6 +113,18 @@ class SeededEvalCallback(EvalCallback):
         self.best_mean_reward, self.last_mean_reward = max(means), means[-1]
         self.n_calls = self.model.num_timesteps // self.training_env.num_envs  # as if evaluations had never stopped
 
+    def checkpoint_state(self) -> dict[str, Any]:
+        """State that the notes of a checkpoint keep, so that a resumed training goes on with the same evaluations."""
+        return {"history": plain(self.history)}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """
+        Go on with the evaluations before a checkpoint.
+
+        :param state: what :meth:`checkpoint_state` returned; that of an earlier version may have ``history`` alone
+        """
+        self.history = [dict(row) for row in state["history"]]
+
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
             return True
@@ -207,6 +219,18 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
         seen = {row["timesteps"]: {name: value for name, value in row.items() if not np.isnan(value)} for row in rows}
         self.history = [row | seen.get(row["timesteps"], {}) for row in self.history]
 
+    def checkpoint_state(self) -> dict[str, Any]:
+        """See :meth:`SeededEvalCallback.checkpoint_state`; here are the metrics since the last evaluation too."""
+        metrics = {"since_evaluation": self._since_evaluation, "watched": self._watched, "in_a_row": self._in_a_row}
+        return super().checkpoint_state() | plain(metrics)
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """See :meth:`SeededEvalCallback.restore_checkpoint_state`."""
+        super().restore_checkpoint_state(state)
+        self._since_evaluation = {name: list(values) for name, values in state.get("since_evaluation", {}).items()}
+        self._watched = dict(state.get("watched", {}))
+        self._in_a_row |= state.get("in_a_row", {})
+
     def _on_rollout_start(self) -> None:
         """Collect the metrics that the last gradient steps logged, because the logger forgets them at every dump."""
         logged = self.logger.name_to_value
@@ -238,10 +262,9 @@ class GuiderLearnerEvalCallback(SeededEvalCallback):
         guider = {"guider": self._guider_returns.mean()}
         self.history[-1].update(guider | {name.removeprefix("train/"): value for name, value in self._watched.items()})
         if self._directory is not None:
-            np.savez(
-                self._directory / GUIDER_EVALUATIONS,
-                **{name: np.array([entry.get(name, np.nan) for entry in self.history]) for name in self.history[-1]},  # type: ignore[arg-type]
-            )
+            names = {name: None for row in self.history for name in row}
+            columns: dict[str, Any] = {name: np.array([row.get(name, np.nan) for row in self.history]) for name in names}
+            np.savez(self._directory / GUIDER_EVALUATIONS, **columns)
         self._warn_if_not_following(self._guider_returns, returns)
 
     def _warn_if_not_following(self, guider_returns: np.ndarray, learner_returns: np.ndarray) -> None:

@@ -175,13 +175,13 @@ def learn(job: Job) -> tuple[list[dict[str, float]], float]:
     )
     started, before, resumed = time.time(), 0.0, model.resumed_notes is not None
     if resumed:
-        evaluation.history, before = model.resumed_notes["history"], model.resumed_notes["minutes"]
+        before = model.resumed_notes["minutes"]
+        evaluation.restore_checkpoint_state(model.resumed_notes)
         evaluation.n_calls = model.num_timesteps // options.envs  # evaluations are counted from the run's start
     left = model.steps_left if resumed else options.steps
 
     def notes() -> dict[str, Any]:
-        history = [{key: float(value) for key, value in row.items()} for row in evaluation.history]
-        return {"history": history, "minutes": before + (time.time() - started) / 60}
+        return {**evaluation.checkpoint_state(), "minutes": before + (time.time() - started) / 60}
 
     if left > 0:
         root = directory / CHECKPOINTS
