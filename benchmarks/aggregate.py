@@ -130,7 +130,7 @@ def summarise_cells(tidy: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
     rows = []
     for cell_key, cell in tidy.groupby(CELL, sort=False):
         scores = run_scores(cell)
-        of_reference = scores[scores.algorithm == reference].final.mean()
+        of_reference = float(scores[scores.algorithm == reference].final.mean())
         for algorithm, group in cell.groupby("algorithm", sort=False):
             own = scores[scores.algorithm == algorithm].sort_values("seed")
             rows.append(
@@ -171,7 +171,8 @@ def steps_to(group: pd.DataFrame, threshold: float) -> int | None:
         threshold; ``None`` if no evaluation reaches it
     """
     mean = group.groupby("timesteps").learner.mean()
-    reached = mean.index[mean >= threshold]
+    # The mean of the same returns may differ in its last digit, by the order in which they are summed up
+    reached = mean.index[(mean >= threshold) | np.isclose(mean, threshold, rtol=1e-9, atol=0)]
     return int(reached[0]) + steps_before(group) if len(reached) else None
 
 

@@ -9,6 +9,7 @@ The command reads ``halfcheetah.csv`` and ``halfcheetah.json``. Beside them, it 
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Collection, Mapping, Sequence
@@ -17,17 +18,20 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from benchmarks.intervals import mean_interval
 from benchmarks.page.cells import NOT_RUN, grid, is_wanted, palette, returns_range, title_of
 from benchmarks.page.digits import with_all_digits
 from benchmarks.page.document import page
 from benchmarks.page.plots import RETURN, curves, has_guider, steps_label
 from benchmarks.page.plots import interactive as interactive  # the plot of returns on the page, a figure of plotly
-from benchmarks.page.summary import seeds_compared
+from benchmarks.page.summary import about_intervals, seeds_compared
+from benchmarks.page.tables import SAME_MEAN
 from benchmarks.tidy import NEEDED, file_of, number, read_tidy, with_needed_steps
 
 matplotlib.use("Agg")
@@ -97,11 +101,11 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
     :param cells: "cells" of the aggregated results: one mapping for each algorithm in each cell
     :return: Markdown table of the final returns
     """
-    head = ("task", "noise", "algorithm", "learner, each seed", "mean", "IQM [95%]", "guider", "KL / target: min, mean, max")
+    returns = ("learner, each seed", "mean [95%]", "IQM [95%]", "guider")
+    head = ("task", "noise", "algorithm", *returns, "KL / target: min, mean, max")
     plain = partial(number, thousands="")
     rows = []
     for cell in cells:
-        iqm, low, high = cell["final_iqm"]
         kl = (
             ", ".join(f"{cell[f'kl_over_target_{name}']:.2f}" for name in ("min", "mean", "max"))
             if "kl_over_target_min" in cell
@@ -111,16 +115,21 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
         seeds = ", ".join(map(plain, cell["final"]))
         noise = "" if cell["noise"] is None else f"{cell['noise']:g}"
         after = f", after {cell[NEEDED]:,} steps of needed runs" if NEEDED in cell else ""
-        first = (cell["task"], noise, cell["algorithm"] + after, seeds, plain(cell["final_mean"]))
-        interval = f" [{plain(low)}, {plain(high)}]" if len(cell["final"]) > 1 else ""
-        rows.append((*first, f"{plain(iqm)}{interval}", guider, kl))
+        mean = _with_interval(mean_interval(np.array(cell["final"], dtype=float)))
+        iqm = _with_interval(cell["final_iqm"]) if len(cell["final"]) > SAME_MEAN else ""
+        rows.append((cell["task"], noise, cell["algorithm"] + after, seeds, mean, iqm, guider, kl))
     return markdown(head, rows)
+
+
+def _with_interval(estimate: Sequence[float]) -> str:
+    value, low, high = (number(part, thousands="") for part in estimate)
+    return value if math.isinf(estimate[1]) else f"{value} [{low}, {high}]"
 
 
 def overall_table(results: dict[str, Any]) -> str:
     """
     :param results: aggregated results
-    :return: Markdown table of the comparisons over all cells
+    :return: Markdown table of the comparisons over all cells, with a sentence where the intervals are of few seeds
     """
     sections = (("normalised_iqm", "normalised IQM"), ("probability_of_improvement", "probability of improvement"))
     several = seeds_compared(results) > 1
@@ -129,7 +138,9 @@ def overall_table(results: dict[str, Any]) -> str:
         for key, label in sections
         for name, (value, low, high) in results[key].items()
     ]
-    return markdown(("over all cells", "algorithm", "estimate [95%]"), rows)
+    table = markdown(("over all cells", "algorithm", "estimate [95%]"), rows)
+    note = about_intervals(results)
+    return f"{table}\n\n{note}" if note else table
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

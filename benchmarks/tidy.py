@@ -29,7 +29,9 @@ def read_tidy(path: Path | TextIO) -> pd.DataFrame:
     :param path: CSV file of aggregated evaluations, or its text in an open file
     :return: table of evaluations, with ``NO_NOISE`` where the noise is empty
     """
-    return pd.read_csv(path, dtype={"noise": float}).fillna({"noise": NO_NOISE})
+    # A task may be named 2048, and an algorithm NA: names are no numbers, and none of them is missing
+    as_written = {"task": str, "algorithm": str}
+    return pd.read_csv(path, dtype={"noise": float}, converters=as_written).fillna({"noise": NO_NOISE})
 
 
 def with_needed_steps(tidy: pd.DataFrame) -> pd.DataFrame:

@@ -40,7 +40,7 @@ def _names_by_then(block, folder):
     names = {"gymnasium": gym, "np": np, "GAC": GAC, "env": env, "settings": SMALL}
     if "model" in block or "clone" in block or "act(" in block:
         names["model"] = GAC("MultiInputPolicy", env, **SMALL).learn(110)
-    if "clone_behaviour" in block:
+    if "teacher" in block:
         names["teacher"] = AsymmetricSAC("MultiInputPolicy", env, **SMALL, role_keys={"actor": ["partial", "privileged"]})
         space = env.observation_space["partial"]
         names["observations"] = np.stack([space.sample() for _ in range(40)])

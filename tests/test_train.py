@@ -301,8 +301,9 @@ def test_minutes_are_those_of_all_processes(tmp_path, monkeypatch):
             main([*QUICK, "--runs", str(tmp_path)])
     (directory,) = tmp_path.iterdir()
     main(["--resume", str(directory)])
-    # From the start to the checkpoints at 0, at 100 steps and of the stop; then to those at 300 and of the end, and to the end
-    minutes = 3 + 3
+    # From the start to the check of the notes, to the checkpoints at 0, at 100 steps and of the stop; then to the check again,
+    # to the checkpoints at 300 and of the end, and to the end
+    minutes = 4 + 4
     assert json.loads((directory / "results.json").read_text())["minutes"] == minutes
 
 

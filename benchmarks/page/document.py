@@ -11,7 +11,7 @@ import yaml
 from plotly.offline import get_plotlyjs
 
 from benchmarks.page.plots import Plot, plots
-from benchmarks.page.summary import ENOUGH, in_short, seeds_compared, what_was_compared
+from benchmarks.page.summary import about_intervals, in_short, what_was_compared
 from benchmarks.page.tables import differences_table, overall_table, returns_table, with_surroundings
 
 HERE = Path(__file__).parent
@@ -105,10 +105,8 @@ def _notes(equal_returns: Sequence[str]) -> str:
 
 
 def _about_intervals(results: dict[str, Any]) -> str:
-    seeds = seeds_compared(results)
-    if not 1 < seeds < ENOUGH:
-        return ""
-    return f"<p class=note>These are bootstrap intervals. Those of {seeds} seeds are too narrow for a verdict.</p>"
+    note = about_intervals(results)
+    return f"<p class=note>{note}</p>" if note else ""
 
 
 def _origin(results: dict[str, Any]) -> str:

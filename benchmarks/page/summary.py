@@ -90,6 +90,17 @@ def seeds_compared(results: Mapping[str, Any]) -> int:
     return min((len(cell["seeds"]) for cell in results["cells"] if cell["algorithm"] in compared), default=0)
 
 
+def about_intervals(results: Mapping[str, Any]) -> str:
+    """
+    :param results: aggregated results
+    :return: sentences on the intervals of the comparisons over all cells, where these are too narrow; else the empty text
+    """
+    seeds = seeds_compared(results)
+    if not 1 < seeds < ENOUGH:
+        return ""
+    return f"These are bootstrap intervals. Those of {seeds} seeds are too narrow for a verdict."
+
+
 def _about_seeds(results: dict[str, Any]) -> list[str]:
     fewest = min(len(cell["seeds"]) for cell in results["cells"])
     if fewest >= 5:

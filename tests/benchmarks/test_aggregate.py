@@ -1,5 +1,6 @@
 """Scores of finished runs, by hand."""
 
+import io
 import math
 from contextlib import nullcontext
 from pathlib import Path
@@ -14,6 +15,7 @@ from benchmarks.bootstrap import interval
 from benchmarks.finished import FinishedRun
 from benchmarks.run_checks import check_finite, with_equal_returns
 from benchmarks.suite import RunSpec
+from benchmarks.tidy import read_tidy
 
 
 @pytest.fixture(autouse=True)
@@ -47,6 +49,28 @@ def test_summary_by_hand():
     assert (ours["kl_over_target_min"], ours["kl_over_target_mean"], ours["kl_over_target_max"]) == (0.8, 1.4, 2.0)
     assert theirs["final_iqm"] == [98.4, 98.4, 98.4]
     assert "guider_mean" not in theirs
+
+
+def test_an_algorithm_reaches_its_own_end():
+    """The mean of these three differs in its last digit by the order of the sum."""
+    ends = {0: 2002.46, 1: 1996.09, 2: 2001.34}
+    tidy = pd.concat([_evaluations("sac-asym", seed, [0, end]) for seed, end in ends.items()])
+    (cell,) = summarise_cells(tidy, reference="sac-asym")
+    assert cell["steps_to_reference"] == 10_000
+
+
+@pytest.mark.parametrize("name", ["NA", "None", "2048", "0.10", "nan"])
+def test_names_that_look_like_numbers_or_gaps_are_names(name):
+    written = io.StringIO()
+    pd.concat([_evaluations(name, 0, [1, 2], task=name), _evaluations("sac", 0, [1, 2], task=name)]).to_csv(
+        written, index=False
+    )
+    written.seek(0)
+    cells = summarise_cells(read_tidy(written), reference=name)
+    assert [(cell["task"], cell["algorithm"], cell["steps_to_reference"]) for cell in cells] == [
+        (name, name, 10_000),
+        (name, "sac", 10_000),
+    ]
 
 
 def test_a_runs_scores_are_its_last_return_and_the_mean_of_all():

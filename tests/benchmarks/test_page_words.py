@@ -75,8 +75,15 @@ def test_of_one_seed_there_is_no_interval():
     assert "<td class=short-text>0.70 to 1.10</td>" in three
     assert "0.90 [0.70, 1.10]" in markdown_over_all(_results(seeds=2))
     assert "[" not in markdown_over_all(_results(seeds=1)).replace("estimate [95%]", "")
-    assert "| 5.40 [1.00, 9.00] |" in cells_table([_cell("gac", [5.0, 5.0])])
-    assert "| 5.40 |" in cells_table([_cell("gac", [5.0])])
+    assert "Those of 2 seeds are too narrow for a verdict." in markdown_over_all(_results(seeds=2))
+    assert "too narrow" not in markdown_over_all(_results(seeds=1)) + markdown_over_all(_results(seeds=5))
+
+
+def test_intervals_of_the_printed_table_hold_for_the_number_of_seeds():
+    """Student's t of the mean, by hand: of 4 and 6 it is 5, and 12.706 times 1 to both sides. The IQM of few is the mean."""
+    assert "| 4.00, 6.00 | 5.00 [-7.71, 17.7] |  |" in cells_table([_cell("gac", [4.0, 6.0])])
+    assert "| 5.00 | 5.00 |  |" in cells_table([_cell("gac", [5.0])])
+    assert "| 5.40 [1.00, 9.00] |" in cells_table([_cell("gac", [4.0, 5.0, 5.0, 6.0])])
     assert "Those of 2 seeds are too narrow for a verdict." in _about_intervals(_results(seeds=2))
     assert _about_intervals(_results(seeds=1)) == _about_intervals(_results(seeds=5)) == ""
 

@@ -92,6 +92,7 @@ def stand_in(monkeypatch):
     """``humanoid_bench``, with a table of fields of which MuJoCo has some no more."""
     package, sizes, env = (ModuleType(f"humanoid_bench{name}") for name in ("", ".dmc_deps.dmc_sizes", ".env"))
     sizes.array_sizes = {"mjmodel": {"nothing": (), "body_pos": ()}, "mjdata": {"qM": (), "no_field": (), "qpos": ()}}
+    monkeypatch.setattr(_HumanoidEnv, "__module__", env.__name__)
     env.HumanoidEnv, env.TASKS = _HumanoidEnv, {task.partition("-")[2]: _Task for task in TASKS}
     package.__path__ = []
     modules = {module.__name__: module for module in (package, sizes, env)} | {

@@ -25,10 +25,10 @@ def make_limited():
     return gym.wrappers.TimeLimit(make_long(), 30)
 
 
-@pytest.mark.parametrize(("maker", "steps"), [("make_long", ["10"]), ("make_limited", [])], ids=["no limit known", "limited"])
+@pytest.mark.parametrize(("maker", "steps"), [("make_long", ["20"]), ("make_limited", [])], ids=["no limit known", "limited"])
 def test_episodes_that_may_never_end_are_warned_of_before_they_are_waited_for(maker, steps, tmp_path):
     env_id = f"{__name__}:{maker}"
-    options = ["--env", env_id, "--steps", "100", "--envs", "1", "--episodes", "1", "--overrides", SMALL]
+    options = ["--env", env_id, "--steps", "200", "--envs", "1", "--episodes", "1", "--overrides", SMALL]
     job = prepare(parse_arguments([*options, "--runs", str(tmp_path)]))
     with job.alone, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
