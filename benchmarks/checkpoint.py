@@ -112,7 +112,8 @@ class SB3Checkpoints(ExactCheckpoints):
         for path in (self._directory, self._with(".old")):
             if path.exists():
                 model = algorithm_class.load(path / "model", env=env, device="cpu")
-                model.load_replay_buffer(path / "replay_buffer.pkl")
+                if hasattr(model, "load_replay_buffer"):  # on-policy algorithms have none
+                    model.load_replay_buffer(path / "replay_buffer.pkl")
                 model.set_random_seed(hash((seed, model.num_timesteps)) % 2**31)
                 return model, _as_state(json.loads((path / "history.json").read_text()))
         return None
@@ -134,7 +135,8 @@ class SB3Checkpoints(ExactCheckpoints):
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir()
         model.save(new / "model")
-        model.save_replay_buffer(new / "replay_buffer.pkl")
+        if hasattr(model, "save_replay_buffer"):
+            model.save_replay_buffer(new / "replay_buffer.pkl")
         write_atomically(new / "history.json", json.dumps(evaluations))
         shutil.rmtree(old, ignore_errors=True)
         if current.exists():

@@ -22,9 +22,10 @@ from benchmarks.config import check_programs, check_runs, check_simulators, firs
 from benchmarks.environments import EVAL_SEED, environment, make_envs
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, worth
 from benchmarks.run import check_unfinished
-from benchmarks.suite import NAME, RunSpec, cells_of, default_name, read_definitions, read_suite
+from benchmarks.suite import NAME, RunSpec, cells_of, default_name, read_definitions
 from benchmarks.tidy import file_of, read_tidy
 from benchmarks.yaml_checks import check_is
+from sb3_gac.checkpoint.lock import locked
 from sb3_gac.command_line import Parser, from_yaml, mapping, one_of, positive
 from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
@@ -188,7 +189,7 @@ def run(options: argparse.Namespace) -> Path:
         a run failed
     """
     runs = options.out / "runs"
-    # The processes of runs start in another folder, and must find the modules that this one finds
+    # The processes of runs must find the modules that this one finds, beside it
     os.environ["PYTHONPATH"] = os.pathsep.join([os.getcwd(), *filter(None, [os.environ.get("PYTHONPATH")])])
     specs = [spec for cell in cells_of(SUITE, yaml.safe_load(_as_yaml(options))) for spec in cell]
     _check_split(specs[0])
@@ -200,15 +201,17 @@ def run(options: argparse.Namespace) -> Path:
     check_programs(job.spec for job in jobs)
     check_simulators(job.spec for job in jobs)
     _check_goals(specs[0])
-    suite = write_suite(options)  # after all checks: a comparison that is refused leaves an earlier one as it was
-    left = f"{counted(len(jobs), 'run')} of {options.steps:,} steps to do"
-    print(f"{left}, {finished} done; all is in {options.out}.", flush=True)
     engine = launch.LocalEngine() if options.ray is None else launch.RayEngine(options.ray)
-    launch.launch(jobs, options.jobs or engine.cpus, 1, engine, finished)
-    if failed := [job for job in jobs if job.state == "failed"]:
-        logs = "\n".join(f"  {job.log}: {job.reason}" for job in failed)
-        raise ValueError(f"{counted(len(failed), 'run')} failed. The logs say why; then the same command goes on:\n{logs}")
-    return write_results(options, suite, runs)
+    runs.mkdir(parents=True, exist_ok=True)
+    with locked(runs):  # another comparison would make this one's processes read another suite
+        suite = write_suite(options)  # after all checks: a comparison that is refused leaves an earlier one as it was
+        left = f"{counted(len(jobs), 'run')} of {options.steps:,} steps to do"
+        print(f"{left}, {finished} done; all is in {options.out}.", flush=True)
+        launch.launch(jobs, options.jobs or engine.cpus, 1, engine, finished)
+        if failed := [job for job in jobs if job.state == "failed"]:
+            logs = "\n".join(f"  {job.log}: {job.reason}" for job in failed)
+            raise ValueError(f"{counted(len(failed), 'run')} failed. The logs say why; then the same command goes on:\n{logs}")
+        return write_results(options, specs, suite, runs)
 
 
 def _check_steps(specs: Sequence[RunSpec]) -> None:
@@ -241,11 +244,12 @@ def _check_goals(spec: RunSpec) -> None:
         )
 
 
-def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
+def write_results(options: argparse.Namespace, specs: Sequence[RunSpec], suite: Path, runs: Path) -> Path:
     """
     Aggregate finished runs, write the page, and print its conclusions.
 
     :param options: options of the comparison, see :func:`parse_arguments`
+    :param specs: settings of the runs
     :param suite: path of the suite's file
     :param runs: directory of the finished runs
     :return: path of the page
@@ -253,11 +257,10 @@ def write_results(options: argparse.Namespace, suite: Path, runs: Path) -> Path:
     results = options.out / "results"
     aggregate.main([str(suite), "--runs", str(runs), "--out", str(results)])
     tidy = read_tidy(file_of(results, "csv"))
-    specs = read_suite(suite)
     deployable = {spec.algorithm for spec in specs if reads_partial_alone(spec)}
     found = worth(tidy, untrained_returns(specs[0], options.out / "untrained.json"), deployable)
     path: Path = options.out / "index.html"
-    path.write_text(page(tidy, found, command(options), file_of(results, "json"), options.steps))
+    write_atomically(path, page(tidy, found, command(options), file_of(results, "json"), options.steps))
     print("\n" + "\n".join([*recommendation(found, options.steps), "", *findings(found)]))
     return path
 
@@ -272,10 +275,13 @@ def untrained_returns(spec: RunSpec, path: Path) -> dict[str, np.ndarray]:
     wrappers = spec.environment["wrappers"] if spec.environment else []
     what = {"environment": environment(spec), "wrappers": wrappers, "episodes": [UNTRAINED_EPISODES, spec.eval_episodes]}
     recorded = json.loads(json.dumps(what, default=str))
-    known = json.loads(path.read_text()) if path.exists() else {}
+    try:
+        known = json.loads(path.read_text())
+    except (FileNotFoundError, ValueError):  # the second where a full disk has cut the file off
+        known = {}
     if known.get("of") != recorded:
         known = {"of": recorded, "returns": _untrained_returns(spec)}
-        path.write_text(json.dumps(known))
+        write_atomically(path, json.dumps(known))
     return {name: np.array(returns) for name, returns in known["returns"].items()}
 
 
@@ -298,7 +304,7 @@ def main(description: str | None = None) -> None:
     options = parse_arguments(description)
     try:
         print(f"\nPage: {run(options)}")
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
         sys.exit(str(error))
 
 

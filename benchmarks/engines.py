@@ -20,15 +20,17 @@ _PR_SET_PDEATHSIG = 1
 _prctl: Any = ctypes.CDLL(None).prctl if sys.platform == "linux" else None  # on other systems runs outlive a killed launch
 
 
-def run_process(command: list[str], log: Path) -> int:
+def run_process(command: list[str], log: Path, folder: Path | None = None) -> int:
     """
-    Run a command in a process with one thread. The process ends with the one that started it, so that no run goes on training
-    after its launch was killed or its node was lost.
+    Run a command in a process with one thread, which finds the benchmarks from every folder. The process ends with the one
+    that started it, so that no run goes on training after its launch was killed or its node was lost.
 
     :param command: words of the command
     :param log: file to which the output is appended
+    :param folder: folder in which the process starts, for the relative paths of environments; ``None`` for the present one
     :return: exit status of the process
     """
+    path = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     with log.open("a") as file:
         file.write(f"{ATTEMPT}{shlex.join(command)}\n")
         file.flush()
@@ -36,8 +38,8 @@ def run_process(command: list[str], log: Path) -> int:
             command,
             stdout=file,
             stderr=subprocess.STDOUT,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-            cwd=HERE.parent,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path},
+            cwd=folder,
             preexec_fn=partial(end_with_parent, os.getpid()),
             check=False,
         ).returncode
@@ -59,7 +61,8 @@ def end_with_parent(parent: int) -> None:
 class LocalEngine:
     """Runs processes on this machine."""
 
-    cpus = os.cpu_count() or 1
+    #: Processors that this process may use, which a cluster or a container may have limited
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
     def run(self, command: list[str], log: Path) -> int:
         """See :func:`run_process`."""
@@ -83,12 +86,12 @@ class RayEngine:
         environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(path)}}
         ray.init(address, log_to_driver=False, runtime_env=environment, ignore_reinit_error=True)
         self._ray = ray
-        self._run = ray.remote(num_cpus=1, max_retries=NODE_LOSSES)(run_process)
+        self._run: Any = ray.remote(num_cpus=1, max_retries=NODE_LOSSES)(run_process)
         self.cpus = int(ray.cluster_resources().get("CPU", 1))
 
     def run(self, command: list[str], log: Path) -> int:
-        """See :func:`run_process`; waits until a node is free."""
-        return self._ray.get(self._run.remote(command, log))
+        """See :func:`run_process`; waits until a node is free, and starts there in the folder of the same name."""
+        return self._ray.get(self._run.remote(command, log, Path.cwd()))
 
 
 Engine = LocalEngine | RayEngine

@@ -157,7 +157,7 @@ def _watch(command: list[str], directory: Path) -> Rows:
     before = read_seconds(directory / TIMING) if rows else 0.0
     path = os.pathsep.join(filter(None, [str(HERE.parent), os.environ.get("PYTHONPATH")]))
     ends = partial(end_with_parent, os.getpid())
-    process = subprocess.Popen(command, cwd=HERE.parent, env={**os.environ, "PYTHONPATH": path}, preexec_fn=ends)
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, preexec_fn=ends)
     status = None
     while status is None:
         with suppress(subprocess.TimeoutExpired):

@@ -81,7 +81,8 @@ def _add_job(
 
     :param jobs: run's name -> job, to which the jobs are added
     :param spec: settings of the run
-    :param command: function that makes the command of a run, from the arguments that lead to it from a run of the suite
+    :param command: function that makes the command of a run, from its name and the arguments that lead to it from a run of
+        the suite
     :param runs: directory of all runs
     :param needed: arguments that lead from a run of the suite to this one, empty for a run of the suite itself
     :return: job of the run
@@ -93,7 +94,7 @@ def _add_job(
             for argument, other in needed_runs(spec).items()
             if not _has_left(argument, other, runs)
         ]
-        jobs[name] = Job(spec, spec.directory(runs), command(needed), needs=needs)
+        jobs[name] = Job(spec, spec.directory(runs), command(name, needed), needs=needs)
     return jobs[name]
 
 
@@ -102,16 +103,17 @@ def _has_left(argument: str, spec: RunSpec, runs: Path) -> bool:
     return is_finished(spec, runs) and file_for(argument, spec, runs).exists()
 
 
-def run_command(suite: Path, index: int, runs: Path, needed: Sequence[str] = ()) -> list[str]:
+def run_command(suite: Path, index: int, runs: Path, name: str, needed: Sequence[str] = ()) -> list[str]:
     """
     :param suite: YAML file of the suite
     :param index: index of the run in the suite
     :param runs: directory of all runs
+    :param name: name of the run to make, since another process may change the suite before this one starts
     :param needed: arguments that lead from this run to a run that it needs, empty for the run itself
     :return: words of the command that makes the run, or the run that it needs
     """
     command = [sys.executable, "-m", "benchmarks.run", "--suite", str(suite), "--index", str(index), "--runs", str(runs)]
-    return [*command, *(["--needed", *needed] if needed else [])]
+    return [*command, "--expect", name, *(["--needed", *needed] if needed else [])]
 
 
 def launch_one(job: Job, retries: int, engine: Engine, tell: Callable[[Job], None]) -> None:
@@ -246,7 +248,8 @@ def main() -> None:
         if not options.dry_run:
             check_programs(job.spec for job in jobs)
             check_simulators(job.spec for job in jobs)
-    except (ValueError, OSError) as error:
+            engine = LocalEngine() if options.engine == "local" else RayEngine(options.address)
+    except (ValueError, OSError, ImportError) as error:  # a cluster that is not there is an OSError
         sys.exit(str(error))
     except KeyboardInterrupt:
         print("Stopped before the first run.", file=sys.stderr)
@@ -255,7 +258,6 @@ def main() -> None:
     if options.dry_run:
         print("\n".join([*(shlex.join(job.command) for job in jobs), f"# {finished} finished, {left}."]))
         return
-    engine = LocalEngine() if options.engine == "local" else RayEngine(options.address)
     at_once = options.jobs or engine.cpus
     print(f"{options.suite.name}: {finished} finished before, {left}, {at_once} at once.", flush=True)
     launch(jobs, at_once, options.retries, engine, finished)

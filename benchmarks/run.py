@@ -26,7 +26,7 @@ from benchmarks.checkpoint import TIMING, checkpoints_of, read_seconds, write_at
 from benchmarks.config import POLICY, in_present_names, normalization, resolve, settings_in_present_names
 from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.external import Program
-from benchmarks.finished import is_finished
+from benchmarks.finished import is_finished, name_of
 from benchmarks.program import read_rows, rows_as_text
 from benchmarks.suite import RUNS, UNSAID, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.base.recording import holds_every_step
@@ -265,6 +265,9 @@ def main() -> None:
         metavar="ARGUMENT",
         help="not that run, but the one whose model it needs as this argument",
     )
+    parser.add_argument(
+        "--expect", metavar="NAME", help="name that the run must have; launch gives it, because a suite may change meanwhile"
+    )
     options = parser.parse_args()
     try:
         specs = read_suite(options.suite)
@@ -279,6 +282,8 @@ def main() -> None:
             named = f"it needs runs as {sorted(needed)}" if needed else "it needs no other run"
             sys.exit(f"--needed: {spec.algorithm} needs no run as {argument!r}; {named}.")
         spec = needed[argument]
+    if options.expect not in (None, found := name_of(spec)):
+        sys.exit(f"{options.suite} has changed since the launch began: in place of {options.expect} it has {found} there.")
     print(run(spec, options.runs, progress_bar=sys.stderr.isatty()))
 
 

@@ -343,6 +343,8 @@ def test_returns_without_training_are_read_again_only_where_they_are_of_the_same
         expected = {"random actions": [2 * number - 1], "the middle action": [2 * number]}
         assert comparison.untrained_returns(other, path) == comparison.untrained_returns(other, path) == expected
     assert comparison.untrained_returns(replace(specs[-1], seed=3, algorithm="gac"), path) == expected
+    path.write_text(path.read_text()[:9])  # by a full disk
+    assert comparison.untrained_returns(specs[-1], path) == {"random actions": [13], "the middle action": [14]}
 
 
 def test_policies_without_training_by_hand(tmp_path):

@@ -102,6 +102,26 @@ def _log(tmp_path, code):
     return log, run_process([sys.executable, "-c", code], log)
 
 
+def test_a_process_has_the_folder_of_who_starts_it_and_finds_the_benchmarks(tmp_path, monkeypatch):
+    """Environments may have relative paths."""
+    (tmp_path / "robot.txt").touch()
+    monkeypatch.chdir(tmp_path)
+    log, status = _log(tmp_path, "import benchmarks.run; open('robot.txt')")
+    assert status == 0, log.read_text()
+
+
+def test_a_run_that_the_suite_has_no_longer_in_its_place_is_not_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmarks.run, "run", lambda *_, **__: pytest.fail("another run was made"))
+    command = launch.run_command(
+        Path(benchmarks.run.__file__).parent / "suites/smoke.yml", 0, tmp_path, "small-600/Elsewhere/gac/seed0"
+    )
+    monkeypatch.setattr(sys, "argv", command[2:])
+    with pytest.raises(
+        SystemExit, match="has changed since the launch began: in place of small-600/Elsewhere/gac/seed0 it has"
+    ):
+        benchmarks.run.main()
+
+
 @pytest.mark.parametrize(
     ("code", "reason"),
     [

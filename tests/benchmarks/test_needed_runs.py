@@ -182,8 +182,12 @@ def launched(tmp_path_factory):
 
 def test_launch_runs_what_is_needed_and_hands_on_its_model(launched):
     path, runs, commands = launched
-    suite = run_command(path, 0, runs)
-    assert commands == [[*suite, "--needed", "teacher"], suite, run_command(path, 1, runs)]
+    teacher, student, other = map(name_of, (needed_runs(read_suite(path)[0])["teacher"], *read_suite(path)))
+    assert commands == [
+        run_command(path, 0, runs, teacher, ["teacher"]),
+        run_command(path, 0, runs, student),
+        run_command(path, 1, runs, other),
+    ]
     directory = runs / "small-60/Pendulum-noise0.1/taught/seed0"
     model = Taught.load(directory / "model")
     assert model.teacher == str(runs / "small-40/Pendulum-noise0.1/sac-full/seed0/model.zip")

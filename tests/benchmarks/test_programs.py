@@ -21,6 +21,7 @@ import pytest
 import torch as th
 import yaml
 from gymnasium import spaces
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import ConvertCallback
 
 import benchmarks.config
@@ -700,6 +701,13 @@ def test_sb3s_runs_go_on_from_the_newest_checkpoint_with_numbers_that_were_not_d
         seeds.append(model.seed)
     assert len(set(seeds[1:])) == 3, "other numbers for another seed, and at another step"
     assert not {0, 3, 4} & set(seeds), "nor those that the run began with"
+
+
+def test_sb3s_on_policy_algorithms_have_checkpoints_without_a_buffer(tmp_path):
+    env, checkpoints = sb3_gac.envs.make_pendulum(), SB3Checkpoints(tmp_path)
+    checkpoints._save(PPO("MultiInputPolicy", env, n_steps=8).learn(8), {"history": [{"timesteps": 8, "learner": 1.0}]})
+    model, state = checkpoints.resume(PPO, {}, env, 0)
+    assert (model.num_timesteps, state["history"][0]["learner"]) == (8, 1.0)
 
 
 def test_a_run_leaves_signals_to_the_process(tmp_path):
