@@ -89,7 +89,15 @@ def recommendation(found: Worth, steps: int) -> list[str]:
         return [
             "One seed of each algorithm is no basis for a recommendation: which is ahead may be chance. Give more --seeds."
         ]
-    return [*_choice(found), *_next_steps(found)]
+    return [*_choice(found), *_needed(found), *_next_steps(found)]
+
+
+def _needed(found: Worth) -> list[str]:
+    """A sentence for each algorithm whose runs had the steps of other runs beside their own, so that they had more."""
+    return [
+        f"{title(name)} had {steps:,} environment steps beside its own, those of the runs that it needs, such as a teacher's."
+        for name, steps in found.needed.items()
+    ]
 
 
 def _bar(found: Worth) -> str:

@@ -40,7 +40,18 @@ from benchmarks.finished import (
 )
 from benchmarks.run_checks import check_finite, check_same_settings, with_equal_returns
 from benchmarks.suite import HERE, RUNS, needed_steps, read_cells
-from benchmarks.tidy import CELL, NAMES, NEEDED, NO_NOISE, file_of, normalised_scores, read_tidy, run_scores, significant
+from benchmarks.tidy import (
+    CELL,
+    NAMES,
+    NEEDED,
+    NO_NOISE,
+    file_of,
+    normalised_scores,
+    read_tidy,
+    run_scores,
+    significant,
+    steps_before,
+)
 
 REFERENCE = "sac-asym"
 STEADY_FROM = 5_000
@@ -153,14 +164,6 @@ def summarise_cells(tidy: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
 def _named(cell_key: Any) -> dict[str, Any]:
     task, noise = cell_key
     return {"task": task, "noise": None if noise == NO_NOISE else noise}
-
-
-def steps_before(group: pd.DataFrame) -> int:
-    """
-    :param group: evaluations of one algorithm in one cell
-    :return: environment steps of the runs that one run of the algorithm needs
-    """
-    return int(group[NEEDED].max()) if NEEDED in group else 0
 
 
 def steps_to(group: pd.DataFrame, threshold: float) -> int | None:

@@ -19,7 +19,7 @@ import pandas as pd
 from scipy import stats
 
 from benchmarks.intervals import CONFIDENCE, Difference, difference, mean_interval
-from benchmarks.tidy import NO_NOISE, file_of, number, read_tidy
+from benchmarks.tidy import NO_NOISE, file_of, number, read_tidy, steps_before
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
@@ -47,6 +47,8 @@ class Worth(NamedTuple):
     :param in_training: difference of SAC-asym over SAC on partial alone, ``None`` if one of the two has no runs
     :param guider: difference of GAC over SAC-asym, ``None`` if one of the two has no runs
     :param deployable: algorithms that need no privileged entry at deployment, the simplest first
+    :param needed: algorithm -> environment steps of the runs that one of its runs needs, such as a teacher's, on top of its
+        own; without those that need none
     """
 
     ends: dict[str, np.ndarray]
@@ -57,6 +59,7 @@ class Worth(NamedTuple):
     in_training: Difference | None
     guider: Difference | None
     deployable: list[str]
+    needed: dict[str, int]
 
     @property
     def floor(self) -> str:
@@ -104,7 +107,17 @@ def worth(tidy: pd.DataFrame, untrained: Mapping[str, np.ndarray], deployable: C
     span = best - max(mean for mean, _, _ in means.values())
     names = [name for name in ends if name in deployable and name != UNTRAINED]
     simpler_first = sorted(names, key=lambda name: SIMPLER_FIRST.index(name) if name in SIMPLER_FIRST else len(SIMPLER_FIRST))
-    return Worth(ends, by_algorithm(tidy, np.mean), means, span, headroom, in_training, guider, simpler_first)
+    areas = by_algorithm(tidy, np.mean)
+    return Worth(ends, areas, means, span, headroom, in_training, guider, simpler_first, steps_needed(tidy))
+
+
+def steps_needed(tidy: pd.DataFrame) -> dict[str, int]:
+    """
+    :param tidy: evaluations, see :func:`worth`
+    :return: algorithm -> environment steps of the runs that one of its runs needs, without algorithms that need none
+    """
+    steps = {str(name): steps_before(runs) for name, runs in tidy.groupby("algorithm")}
+    return {name: number for name, number in steps.items() if number}
 
 
 def end_of(returns: np.ndarray) -> float:
@@ -185,7 +198,7 @@ def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
     """
     rows = []
     for (task, noise), cell in tidy.groupby(["task", "noise"], sort=False):
-        ends = by_algorithm(cell, end_of)
+        ends, needed = by_algorithm(cell, end_of), steps_needed(cell)
         for name, of_seeds in ends.items():
             spread = f"{of_seeds.std(ddof=1) / abs(of_seeds.mean()):.0%}" if len(of_seeds) > 1 and of_seeds.mean() else ""
             compared = difference(ends, name, reference)[2:] if reference in ends and name != reference else ()
@@ -194,7 +207,7 @@ def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
                 [
                     str(task),
                     "" if noise == NO_NOISE else f"{noise:g}",
-                    name,
+                    after_needed(name, needed),
                     seeds,
                     number(float(of_seeds.mean())),
                     spread,
@@ -202,6 +215,15 @@ def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
                 ]
             )
     return rows
+
+
+def after_needed(name: str, needed: Mapping[str, int]) -> str:
+    """
+    :param name: name of an algorithm, or its title
+    :param needed: name -> environment steps of needed runs
+    :return: the name, with these steps where there are any
+    """
+    return f"{name}, after {needed[name]:,} steps of needed runs" if name in needed else name
 
 
 def read_together(paths: Sequence[Path]) -> pd.DataFrame:

@@ -42,6 +42,14 @@ def with_needed_steps(tidy: pd.DataFrame) -> pd.DataFrame:
     return tidy.assign(timesteps=tidy.timesteps + tidy[NEEDED]) if NEEDED in tidy else tidy
 
 
+def steps_before(group: pd.DataFrame) -> int:
+    """
+    :param group: evaluations of one algorithm in one cell, see :func:`read_tidy`
+    :return: environment steps of the runs that one run of the algorithm needs
+    """
+    return int(group[NEEDED].max()) if NEEDED in group else 0
+
+
 def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
     """
     :param tidy: evaluations, see :func:`read_tidy`

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from benchmarks.advice import findings, in_words, recommendation
+from benchmarks.comparison_page import page
 from benchmarks.headroom import ends_table, headroom_curve, main, number, power, read_together, seeds_to_see, worth
 from benchmarks.tidy import NO_NOISE
 
@@ -61,6 +62,24 @@ def test_a_clear_winner_is_recommended():
     assert findings(found)[2].startswith("A guider is worth 38.0")
     first, second, *_ = recommendation(found, 1000)
     assert (first, second) == ("Train with GAC.", "It ends above SAC on partial alone and SAC-asym, beyond chance.")
+
+
+def test_steps_of_needed_runs_are_told_wherever_the_algorithm_is(tmp_path):
+    """A student that had a teacher's steps too is not set beside the others as if it had not."""
+    tidy = _tidy({"tgrl": [98.0, 99.0, 100.0], "sac-asym": [60.0, 61.0, 62.0]})
+    tidy = tidy.assign(noise=NO_NOISE, needed_steps=np.where(tidy.algorithm == "tgrl", 20_000, 0))
+    found = worth(tidy, RANDOM, DEPLOYABLE | {"tgrl"})
+    assert found.needed == {"tgrl": 20_000}
+    told = "tgrl had 20,000 environment steps beside its own, those of the runs that it needs, such as a teacher's."
+    assert told in recommendation(found, 400)
+    assert [row[2] for row in ends_table(tidy, "sac-asym")] == ["tgrl, after 20,000 steps of needed runs", "sac-asym"]
+    (tmp_path / "results.json").write_text("{}")
+    shown = page(tidy, found, "command", tmp_path / "results.json", 400)
+    assert "tgrl, after 20,000 steps of needed runs" in shown
+    assert "400 environment steps each, beside those of the runs that it needs." in shown
+    without = tidy[tidy.algorithm == "sac-asym"]
+    shown = page(without, worth(without, RANDOM, DEPLOYABLE), "command", tmp_path / "results.json", 400)
+    assert "beside those of the runs" not in shown
 
 
 def test_harm_is_told():
