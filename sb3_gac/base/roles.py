@@ -1,5 +1,6 @@
 """The roles of an algorithm's networks, and settings for each: entries, layers, rates and memories, checked at set-up."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
@@ -142,7 +143,7 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
 
     :param roles: roles of the algorithm
     :param net_arch: one list of sizes for all roles, SB3's ``{"pi": [...], "qf": [...]}``, or one list for each policy and
-        one for "critic"; policies whose layers are the deployed one's have no list
+        one for "critic"; a list for a policy whose layers are the deployed one's has no effect, and is warned of
     :return: role -> list of sizes, for all networks
     :raises ValueError: if ``net_arch`` has none of these forms, or a size is no integer above 0
     """
@@ -152,7 +153,10 @@ def resolve_net_arch(roles: Roles, net_arch: list[int] | Mapping[str, list[int]]
     if isinstance(net_arch, Mapping) and set(net_arch) == {"pi", "qf"}:
         net_arch = {**dict.fromkeys(policies, net_arch["pi"]), CRITICS: net_arch["qf"]}
     if isinstance(net_arch, Mapping) and (needless := sorted(set(net_arch) & set(roles.tied))):
-        raise ValueError(f"net_arch has {needless}, whose layers are those of the {roles.deployed}: leave them out.")
+        # Models of earlier versions have these sizes in their files
+        deployed = f"those of the {roles.deployed}"
+        warnings.warn(f"net_arch has {needless}, whose layers are {deployed}: leave them out.", stacklevel=2)
+        net_arch = {role: sizes for role, sizes in net_arch.items() if role not in needless}
     if not isinstance(net_arch, Mapping) or set(net_arch) != {*policies, CRITICS}:
         raise ValueError(
             f'net_arch must be a list, {{"pi": [...], "qf": [...]}} or one list for each of {[*policies, CRITICS]}, '

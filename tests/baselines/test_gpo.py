@@ -420,10 +420,6 @@ def test_other_environments_in_another_number():
         ({"unroll_length": 0}, "unroll_length must be"),
         ({"clip_range": -0.1}, "clip_range must be"),
         ({"policy_kwargs": {"rnn_type": "gru"}}, "GPOClip has no form with a memory"),
-        (
-            {"policy_kwargs": {"net_arch": {"learner": [8], "guider": [9], "critic": [8]}}},
-            r"net_arch has \['guider'\], whose layers are those of the learner: leave them out",
-        ),
         ({"policy_kwargs": {"net_arch": []}}, "net_arch must have a hidden layer"),
         ({"role_keys": {"guider": ["privileged"]}}, "guider.*lacks"),
     ],
@@ -431,6 +427,16 @@ def test_other_environments_in_another_number():
 def test_what_can_not_be_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         make_model(**arguments)
+
+
+def test_layer_sizes_of_the_guider_have_no_effect_and_are_warned_of(tmp_path):
+    """Models of earlier versions had to have them, and are still to be loaded."""
+    sizes = {"learner": [8], "guider": [9], "critic": [8]}
+    with pytest.warns(UserWarning, match=r"net_arch has \['guider'\], whose layers are those of the learner: leave them out"):
+        model = make_model(policy_kwargs={"net_arch": sizes})
+    model.save(tmp_path / "model")
+    with pytest.warns(UserWarning, match="net_arch has"):
+        assert GPOClip.load(tmp_path / "model").policy.guider.net_arch == [8]
 
 
 def test_layer_sizes_by_network_are_those_of_the_learner_and_of_the_critic():
