@@ -238,7 +238,7 @@ def test_a_function_that_makes_an_environment(engine, monkeypatch, tmp_path):
         ([*SHORT, "--overrides", "{gama: 0.9}"], "gama"),
         ([*SHORT, "--overrides", "{1: 2, foo: 3}"], "has no arguments ['1', 'foo']"),
         (["--env", "Pendulum-v1", "--wrappers", "5"], "wrappers: must be module:Class"),
-        ([*SHORT, "--out", __file__], "File exists"),
+        ([*SHORT, "--out", __file__], "Not a directory"),
         (["--env", "sb3_gac/FetchReach-v4", "--env-kwargs", "{goal_entries: true}"], "sb3_gac.envs:AppendDesiredGoal"),
     ],
 )

@@ -228,9 +228,10 @@ def test_scores_over_all_cells(made):
 
 def test_what_is_reported(made):
     root, said = made
+    # Student's t of five by hand: 193.2 and 307.2, and 2.7764 times 48.45 / sqrt(5) to both sides
     table = [[cell.strip() for cell in line.strip("|").split("|")] for line in said.splitlines()]
-    assert table[2] == ["Toy", "0.1", "toy-gac", "150, 162, 174, 210, 270", "193", "182 [154, 250]", "194", ""]
-    assert table[5][:5] == ["Toy", "0.2", "toy-asym", "264, 276, 288, 324, 384", "307"]
+    assert table[2] == ["Toy", "0.1", "toy-gac", "150, 162, 174, 210, 270", "193 [133, 253]", "182 [154, 250]", "194", ""]
+    assert table[5][:5] == ["Toy", "0.2", "toy-asym", "264, 276, 288, 324, 384", "307 [247, 367]"]
     assert table[5][6] == "", "no guider"
     assert [row[:2] for row in table[9:]] == [
         ["normalised IQM", "toy-gac"],

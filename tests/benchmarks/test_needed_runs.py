@@ -263,13 +263,14 @@ def test_what_a_failed_run_was_needed_for_is_not_started_and_says_why(tmp_path, 
     with pytest.raises(SystemExit) as end:
         benchmarks.launch.main()
     assert end.value.code == 1
+    failing, bereft, orphaned = (f"small-60/Pendulum-noise0.1/{name}/seed0" for name in ("failing", "bereft", "orphaned"))
+    runs = ["--runs", str(tmp_path / "runs"), "--expect"]
     assert [command[command.index("--index") + 1 :] for command in engine.ran] == [
-        ["0", "--runs", str(tmp_path / "runs"), "--needed", "teacher", "teacher"],
-        ["0", "--runs", str(tmp_path / "runs"), "--needed", "teacher", "teacher"],
-        ["1", "--runs", str(tmp_path / "runs")],
+        ["0", *runs, failing, "--needed", "teacher", "teacher"],
+        ["0", *runs, failing, "--needed", "teacher", "teacher"],
+        ["1", *runs, "small-60/Pendulum-noise0.1/sac-asym/seed0"],
     ]
     said = capsys.readouterr().out
-    failing, bereft, orphaned = (f"small-60/Pendulum-noise0.1/{name}/seed0" for name in ("failing", "bereft", "orphaned"))
     assert f"{bereft}: not started, for it needs {failing}, which failed (" in said
     assert f"{tmp_path / 'runs' / failing}: FAILED, see " in said
     assert f"{tmp_path / 'runs' / bereft}: NOT STARTED, for it needs {failing}, which failed\n" in said

@@ -713,7 +713,7 @@ def test_sb3s_on_policy_algorithms_have_checkpoints_without_a_buffer(tmp_path):
 def test_a_run_leaves_signals_to_the_process(tmp_path):
     """Told to end, it ends at once: a checkpoint between evaluations would shift those to come."""
     seen, before = [], [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
-    callback = checkpoints_of(GAC, tmp_path).callback(SimpleNamespace(history=[]), 1_000)
+    callback = checkpoints_of(GAC, tmp_path).callback(SimpleNamespace(checkpoint_state=dict), 1_000)
     watch = ConvertCallback(lambda *_: seen.append([signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT)]) or True)
     small_model().learn(2, callback=[callback, watch])
     assert seen == [before, before]

@@ -216,7 +216,7 @@ def test_small_returns_are_aggregated_with_their_digits(monkeypatch):
     assert "| 0.00200, 0.00400 | 0.00300 [" in cells_table([cell])
     assert "0.00200, 0.00400" in returns_table([cell])
     small = cell | {"noise": 0.005, "final": [2487.4, 9360.0], "final_mean": 5923.7}
-    assert "| 2487, 9360 | 5924 |" in cells_table([small])
+    assert "| 2487, 9360 | 5924 [" in cells_table([small])
     assert "2,487, 9,360" in returns_table([small])
     assert ">0.005<" in returns_table([small])
 
