@@ -91,11 +91,11 @@ class SeededEvalCallback(EvalCallback):
         # The model wraps its own environments in this way, and SB3 copies statistics between environments wrapped alike
         self.eval_env = BaseAlgorithm._wrap_env(self.eval_env)
         super()._init_callback()
-        if self.log_path is not None and self.model.num_timesteps > 0 and not self.evaluations_timesteps:
+        if self.log_path is not None and not self.evaluations_timesteps:
             self._go_on_from_files()
 
     def _go_on_from_files(self) -> None:
-        """Take over the evaluations up to the present step, because the files are written anew at each evaluation."""
+        """Take over the evaluations up to the present step, none for a new training: each evaluation writes the files anew."""
         stored = _rows_until(self.model.num_timesteps, Path(f"{self.log_path}.npz"))
         if not stored:
             return

@@ -199,7 +199,8 @@ def test_a_teacher_of_other_spaces_is_refused_and_the_former_one_teaches_on(tmp_
 def test_a_learning_rate_of_the_memory_that_the_optimiser_can_not_have_is_refused(tmp_path):
     options = {"rnn_type": "gru", "rnn_hidden_size": 8, "rnn_net_arch": [], "net_arch": [8], "optimizer_class": th.optim.SGD}
     model = registry.make("gac", _env(), seed=0, policy_kwargs=options).learn(40)
-    _refuses(model, "lr_scales", {"memory": 0.1, "critic": 3.0}, tmp_path)
+    scales = {"memory": 0.1, "learner": 3.0, "guider": 3.0, "critic": 3.0}
+    _refuses(model, "lr_scales", scales, tmp_path)
     assert {getattr(model.policy, role).optimizer.param_groups[0]["lr_scale"] for role in model.policy.trained} == {1.0}
 
 
