@@ -103,8 +103,8 @@ class ExactCheckpoints:
 
 class SB3Checkpoints(ExactCheckpoints):
     """
-    The checkpoints of a run of one of SB3's own algorithms: model and replay buffer. A run that goes on from one starts new
-    episodes, with another seed.
+    The checkpoints of a run of one of SB3's own algorithms: model, and replay buffer if it has one. A run that goes on from
+    one starts new episodes, with another seed.
     """
 
     def resume(self, algorithm_class: Any, arguments: dict[str, Any], env: VecEnv, seed: int) -> Resumed | None:

@@ -25,7 +25,7 @@ from benchmarks.run import check_unfinished
 from benchmarks.suite import NAME, RunSpec, cells_of, default_name, read_definitions
 from benchmarks.tidy import file_of, read_tidy
 from benchmarks.yaml_checks import check_is
-from sb3_gac.checkpoint.lock import locked
+from sb3_gac.checkpoint.lock import InUseError, locked
 from sb3_gac.command_line import Parser, from_yaml, mapping, one_of, positive
 from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
@@ -304,7 +304,7 @@ def main(description: str | None = None) -> None:
     options = parse_arguments(description)
     try:
         print(f"\nPage: {run(options)}")
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except (ValueError, OSError, InUseError, ImportError) as error:
         sys.exit(str(error))
 
 

@@ -11,13 +11,13 @@ import pandas as pd
 from plotly import graph_objects
 
 from benchmarks.advice import counted, findings, in_words, recommendation, title
-from benchmarks.headroom import Worth, after_needed, headroom_curve
+from benchmarks.headroom import Worth, headroom_curve
 from benchmarks.intervals import CONFIDENCE, Difference, mean_interval
 from benchmarks.page.cells import palette, title_of
 from benchmarks.page.document import document, tabs
 from benchmarks.page.plots import RETURN, STEPS, Plot, algorithm_lines
 from benchmarks.page.tables import Field, table
-from benchmarks.tidy import number, with_needed_steps
+from benchmarks.tidy import after_needed, number, with_needed_steps
 
 _FRAME = {
     "template": "plotly_white",
@@ -108,12 +108,13 @@ def _headroom(tidy: pd.DataFrame) -> graph_objects.Figure:
 def _ends_table(found: Worth) -> str:
     learned = [name for name in found.deployable or found.ends if name in found.learned]
     best = max(learned, key=lambda name: float(found.ends[name].mean()), default=None)
-    rows, needed = [], {title(name): steps for name, steps in found.needed.items()}
+    rows = []
     for name, ends in sorted(found.ends.items(), key=lambda item: -float(item[1].mean())):
         mean, low, high = mean_interval(ends)
         interval = "one seed" if math.isinf(low) else f"{number(low)} to {number(high)}"
         seeds, curve = ", ".join(map(number, ends)), float(found.areas[name].mean())
-        fields = [Field(after_needed(title(name), needed)), _return(mean), Field(interval), Field(seeds), _return(curve)]
+        shown = after_needed(title(name), found.needed.get(name, 0))
+        fields = [Field(shown), _return(mean), Field(interval), Field(seeds), _return(curve)]
         rows.append((fields, name == best))
     for name, (mean, low, high) in found.untrained.items():
         interval = f"{number(low)} to {number(high)}"
@@ -148,7 +149,8 @@ def _how(found: Worth, command: str, results: Path, steps: int) -> str:
         for key in ("made_with", "cpus", "hours", "settings", "arguments", "normalize", "particulars")
         if key in made
     }
-    needed = ", beside those of the runs that it needs" if found.needed else ""
+    more = "; ".join(after_needed(title(name), number) for name, number in found.needed.items())
+    needed = f" ({more})" if more else ""
     return (
         f"<h2>How it was made</h2><p>{counted(seeds, 'seed')} of each algorithm, {steps:,} environment steps each{needed}. "
         "A run's end is the mean of the last quarter of its evaluations, on environments that training never sees. "

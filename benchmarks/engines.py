@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.suite import HERE
+from sb3_gac.envs.subprocesses import usable_processors
 from sb3_gac.envs.suites.extras import missing_extra
 
 #: Beginning of the line that stands before an attempt's output in a log
@@ -30,7 +31,6 @@ def run_process(command: list[str], log: Path, folder: Path | None = None) -> in
     :param folder: folder in which the process starts, for the relative paths of environments; ``None`` for the present one
     :return: exit status of the process
     """
-    path = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     with log.open("a") as file:
         file.write(f"{ATTEMPT}{shlex.join(command)}\n")
         file.flush()
@@ -38,11 +38,16 @@ def run_process(command: list[str], log: Path, folder: Path | None = None) -> in
             command,
             stdout=file,
             stderr=subprocess.STDOUT,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path},
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": module_path()},
             cwd=folder,
             preexec_fn=partial(end_with_parent, os.getpid()),
             check=False,
         ).returncode
+
+
+def module_path() -> str:
+    """Python's path for another process, which finds the benchmarks there, and all that this process's path has."""
+    return os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
 def end_with_parent(parent: int) -> None:
@@ -61,8 +66,7 @@ def end_with_parent(parent: int) -> None:
 class LocalEngine:
     """Runs processes on this machine."""
 
-    #: Processors that this process may use, which a cluster or a container may have limited
-    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cpus = usable_processors()
 
     def run(self, command: list[str], log: Path) -> int:
         """See :func:`run_process`."""
@@ -82,8 +86,7 @@ class RayEngine:
             import ray
         except ImportError as error:
             raise missing_extra("--engine ray", error.name or "ray", "ray") from None
-        path = [str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
-        environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(path)}}
+        environment = {"env_vars": {"PYTHONPATH": module_path()}}
         ray.init(address, log_to_driver=False, runtime_env=environment, ignore_reinit_error=True)
         self._ray = ray
         self._run: Any = ray.remote(num_cpus=1, max_retries=NODE_LOSSES)(run_process)

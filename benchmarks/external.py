@@ -28,10 +28,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from benchmarks.checkpoint import CHECKPOINT, TIMING, read_seconds, write_atomically, write_timing
-from benchmarks.engines import end_with_parent
+from benchmarks.engines import end_with_parent, module_path
 from benchmarks.environments import EVAL_SEED, environment
 from benchmarks.program import REQUEST, Rows, read_rows
-from benchmarks.suite import HERE, RunSpec
+from benchmarks.suite import RunSpec
 from benchmarks.yaml_checks import check_is
 
 _ASK = """
@@ -155,9 +155,8 @@ def _watch(command: list[str], directory: Path) -> Rows:
     """
     rows, started = read_rows(directory), time.time()
     before = read_seconds(directory / TIMING) if rows else 0.0
-    path = os.pathsep.join(filter(None, [str(HERE.parent), os.environ.get("PYTHONPATH")]))
     ends = partial(end_with_parent, os.getpid())
-    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, preexec_fn=ends)
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": module_path()}, preexec_fn=ends)
     status = None
     while status is None:
         with suppress(subprocess.TimeoutExpired):

@@ -19,7 +19,7 @@ import pandas as pd
 from scipy import stats
 
 from benchmarks.intervals import CONFIDENCE, Difference, difference, mean_interval
-from benchmarks.tidy import NO_NOISE, file_of, number, read_tidy, steps_before
+from benchmarks.tidy import NO_NOISE, after_needed, file_of, number, read_tidy, steps_before
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
@@ -207,7 +207,7 @@ def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
                 [
                     str(task),
                     "" if noise == NO_NOISE else f"{noise:g}",
-                    after_needed(name, needed),
+                    after_needed(name, needed.get(name, 0)),
                     seeds,
                     number(float(of_seeds.mean())),
                     spread,
@@ -215,15 +215,6 @@ def ends_table(tidy: pd.DataFrame, reference: str) -> list[list[str]]:
                 ]
             )
     return rows
-
-
-def after_needed(name: str, needed: Mapping[str, int]) -> str:
-    """
-    :param name: name of an algorithm, or its title
-    :param needed: name -> environment steps of needed runs
-    :return: the name, with these steps where there are any
-    """
-    return f"{name}, after {needed[name]:,} steps of needed runs" if name in needed else name
 
 
 def read_together(paths: Sequence[Path]) -> pd.DataFrame:

@@ -32,7 +32,7 @@ from benchmarks.page.plots import RETURN, curves, has_guider, steps_label
 from benchmarks.page.plots import interactive as interactive  # the plot of returns on the page, a figure of plotly
 from benchmarks.page.summary import about_intervals, seeds_compared
 from benchmarks.page.tables import SAME_MEAN
-from benchmarks.tidy import NEEDED, file_of, number, read_tidy, with_needed_steps
+from benchmarks.tidy import NEEDED, after_needed, file_of, number, read_tidy, with_needed_steps
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -114,10 +114,9 @@ def cells_table(cells: list[dict[str, Any]]) -> str:
         guider = plain(cell["guider_mean"]) if "guider_mean" in cell else ""
         seeds = ", ".join(map(plain, cell["final"]))
         noise = "" if cell["noise"] is None else f"{cell['noise']:g}"
-        after = f", after {cell[NEEDED]:,} steps of needed runs" if NEEDED in cell else ""
         mean = _with_interval(mean_interval(np.array(cell["final"], dtype=float)))
         iqm = _with_interval(cell["final_iqm"]) if len(cell["final"]) > SAME_MEAN else ""
-        rows.append((cell["task"], noise, cell["algorithm"] + after, seeds, mean, iqm, guider, kl))
+        rows.append((cell["task"], noise, after_needed(cell["algorithm"], cell.get(NEEDED, 0)), seeds, mean, iqm, guider, kl))
     return markdown(head, rows)
 
 

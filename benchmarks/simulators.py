@@ -13,7 +13,6 @@ stepped one after the other without a wrapper.  "In SB3" are the same simulators
 
 import argparse
 import json
-import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -27,6 +26,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_gac.envs import BatchVecEnv, make_vec
+from sb3_gac.envs.subprocesses import usable_processors
 from sb3_gac.envs.suites import env_id_of
 from sb3_gac.envs.table import in_columns
 
@@ -212,7 +212,7 @@ def _write(path: Path, env_id: str, n_envs: int, speed: Speed) -> None:
     found = json.loads(path.read_text()) if path.exists() else {}
     one = {name: _rounded(value) for name, value in speed._asdict().items() if value is not None}
     found.setdefault("columns of overheads", ["median", "lower quartile", "upper quartile"])
-    found.setdefault("made with", {}).update(_versions(), cores=os.cpu_count())
+    found.setdefault("made with", {}).update(_versions(), cores=usable_processors())
     found.setdefault("environments", {}).setdefault(env_id, {})[str(n_envs)] = one
     path.write_text(json.dumps(found, indent=1) + "\n")
 

@@ -50,6 +50,15 @@ def steps_before(group: pd.DataFrame) -> int:
     return int(group[NEEDED].max()) if NEEDED in group else 0
 
 
+def after_needed(text: str, steps: int) -> str:
+    """
+    :param text: name of an algorithm
+    :param steps: environment steps of the runs that one run of the algorithm needs
+    :return: the name, with these steps if there are any
+    """
+    return f"{text}, after {steps:,} steps of needed runs" if steps else text
+
+
 def run_scores(tidy: pd.DataFrame) -> pd.DataFrame:
     """
     :param tidy: evaluations, see :func:`read_tidy`

@@ -1,10 +1,9 @@
 """The algorithms of this package by name, in one table for all programs. A class is imported when it is looked up."""
 
-import re
-from collections.abc import Iterable
-from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
+
+from sb3_gac.names import meant
 
 #: Name of an algorithm -> ``module:Class``
 ALGORITHMS = {
@@ -45,22 +44,6 @@ def import_path(path: str) -> Any:
         raise ValueError(f"{path!r}: there is no module {error.name!r} on Python's path.") from None
     except AttributeError:
         raise ValueError(f"{path!r}: the module {module} has no {name!r}.") from None
-
-
-def meant(name: str, known: Iterable[str]) -> str:
-    """
-    Find the name that may be meant by an unknown one.
-
-    :param name: name that is not known
-    :param known: known names
-    :return: question that a message may end with, after a space: whether the known name is meant that is nearly the same, or
-        that has all words of the unknown one; the empty text if there is no such name
-    """
-    by_small_letters = {each.casefold(): each for each in known}
-    words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
-    close = get_close_matches(name.casefold(), by_small_letters, n=1, cutoff=0.7)
-    close = close or [each for each in by_small_letters if words and all(word in each for word in words)]
-    return f' Is "{by_small_letters[close[0]]}" meant?' if close else ""
 
 
 def algorithm_class(name: str) -> type:

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import yaml
 
-from sb3_gac.algorithms import meant
+from sb3_gac.names import meant
 
 #: Name under which all programs can be called
 SCRIPT = "sb3-gac"

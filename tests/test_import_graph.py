@@ -13,12 +13,12 @@ BASELINES = sorted({path.stem for path in (ROOT / "sb3_gac/baselines").glob("[!_
 #: Room -> rooms that it may import
 ROOMS = {
     "math": "math",
-    "checks": "checks|schedules",
+    "checks": "checks|schedules|names",
     "optim": "optim|math|checks",
     "networks": "networks|math|checks",
     "replay": "replay|checks",
     "checkpoint": "checkpoint|envs",
-    "base": "algorithms|base|math|checks|schedules|optim|networks|replay|checkpoint|envs",
+    "base": "algorithms|base|math|checks|schedules|names|optim|networks|replay|checkpoint|envs",
     "deploy": "deploy|base|checks|networks|envs|learner|version|stopping|command_line",
     "evaluation": "evaluation|algorithms|base|envs|learner|training\\.environments",
 }
@@ -39,8 +39,9 @@ FORBIDDEN = {
     "sb3_gac/__main__.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac(?!\.(stopping|version)\b)",
     "sb3_gac/tabular/**/*.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac(?!\.tabular\b)",
     "sb3_gac/schedules.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
-    "sb3_gac/algorithms.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
-    "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.(algorithms|envs\.suites|presets)\b)",
+    "sb3_gac/algorithms.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac(?!\.names\b)",
+    "sb3_gac/names.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
+    "sb3_gac/presets/**/*.py": r"gymnasium\b|stable_baselines3|sb3_gac(?!\.(algorithms|envs\.suites|names|presets)\b)",
     "sb3_gac/learner.py": r"torch\b|gymnasium\b|stable_baselines3|sb3_gac\b",
     "benchmarks/aggregate.py": r"torch\b|sb3_gac\b",
     **{f"benchmarks/{path}.py": rf"torch\b|sb3_gac\b|benchmarks(?!\.({DRAWING})\b)" for path in ("report", "page/**/*")},

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.intervals import mean_interval
 from benchmarks.page.summary import seeds_compared
-from benchmarks.tidy import number
+from benchmarks.tidy import NEEDED, after_needed, number
 
 #: Largest number of seeds whose interquartile mean is their mean
 SAME_MEAN = 3
@@ -94,9 +94,7 @@ def _best(cells: Sequence[Mapping[str, Any]]) -> set[int]:
 def _returns(cell: Mapping[str, Any]) -> Iterator[Field]:
     yield Field(cell["task"])
     yield field(cell["noise"], "g")
-    yield Field(
-        cell["algorithm"] + (f", after {cell['needed_steps']:,} steps of needed runs" if "needed_steps" in cell else "")
-    )
+    yield Field(after_needed(cell["algorithm"], cell.get(NEEDED, 0)))
     yield field(cell["final_mean"])
     _, low, high = mean_interval(np.array(cell["final"], dtype=float))
     yield Field("one seed" if math.isinf(low) else f"{number(low)} to {number(high)}")

@@ -1,6 +1,5 @@
 """The base of off-policy algorithms with a privileged view: arguments, their checks, and the train loop."""
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Mapping
 from math import ceil
@@ -37,7 +36,6 @@ from sb3_gac.checks.requirements import (
 from sb3_gac.networks.heads import resolve_target_entropy
 from sb3_gac.optim.coefficients import Coefficient, make_coefficient
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
-from sb3_gac.replay.episodes import holds_a_batch
 
 ENT_COEF_START = 0.1
 _EPISODE = 1_000
@@ -121,7 +119,6 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         "optimize_memory_usage",
     )
     progress = (*AsymmetricAlgorithm.progress, *DataCollection.collected)
-    _waiting = False
     _shifted_entries: tuple[str, ...] = ()
 
     def __init__(
@@ -346,20 +343,6 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
         metrics = self.update(batch)
         self.policy.update_targets(self.tau)
         return metrics
-
-    def _waits_for_an_episode(self) -> bool:
-        """Whether there is no whole episode to learn from yet, with a warning. (In a full buffer, that is an error.)"""
-        buffer = self.replay_buffer
-        assert buffer is not None
-        waits = buffer.size() > 0 and not buffer.full and not holds_a_batch(buffer)
-        if waits and not self._waiting:
-            warnings.warn(
-                "There are no gradient steps until the first episode has ended, although "
-                f"learning_starts={self.learning_starts} is over: {type(buffer).__name__} samples whole episodes.",
-                stacklevel=3,
-            )
-        self._waiting = waits
-        return waits
 
     def gradient_steps_in(self, steps: int) -> int:
         """See :meth:`Compilation.gradient_steps_in`; where ``train_freq`` counts episodes, they count as 1,000 steps each."""

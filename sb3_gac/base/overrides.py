@@ -1,6 +1,5 @@
 """Checks of arguments given to a model that comes from a file: each has its effect, or is refused by name."""
 
-import difflib
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -9,6 +8,7 @@ from sb3_gac.base.arguments import SHARED
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.arguments import constructor_arguments, constructor_parameters
 from sb3_gac.checks.values import plain
+from sb3_gac.names import meant
 
 #: Attributes that are kept with a model although they are no arguments of its constructor
 SETTINGS = ("strict_deployment",)
@@ -87,7 +87,6 @@ def check_known(kind: type, shared: type, given: Iterable[str]) -> None:
 
 def _unknown(kind: type, name: str, where: str, known: Sequence[str]) -> TypeError:
     policy_class: type = kind.policy_aliases.get("MultiInputPolicy", AsymmetricPolicy)  # type: ignore[attr-defined]
-    close = difflib.get_close_matches(name, known, n=1)
     if name in constructor_parameters(policy_class):
         hint = "It is one of policy_kwargs."
     elif name in _OF_SB3:
@@ -95,7 +94,7 @@ def _unknown(kind: type, name: str, where: str, known: Sequence[str]) -> TypeErr
     elif name in SETTINGS:
         hint = "Set it on the model itself."
     else:
-        hint = f'Is "{close[0]}" meant?' if close else f"It takes {', '.join(known)}."
+        hint = meant(name, known, nearness=0.6).strip() or f"It takes {', '.join(known)}."
     return TypeError(f'{where} got "{name}", which is no argument of {kind.__name__}. {hint}')
 
 

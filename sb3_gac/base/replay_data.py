@@ -15,7 +15,7 @@ from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.checks.policy import check_taken
 from sb3_gac.checks.spaces import check_spaces_of
 from sb3_gac.replay.buffer import CompactDictReplayBuffer
-from sb3_gac.replay.episodes import EpisodeReplayBuffer, check_learns_from_sequences
+from sb3_gac.replay.episodes import EpisodeReplayBuffer, check_learns_from_sequences, holds_a_batch
 from sb3_gac.replay.histories import check_samples_histories
 from sb3_gac.replay.source import ReplaySource
 
@@ -39,6 +39,7 @@ class ReplayData(OffPolicyAlgorithm):
     _resumed_noise: Any
     _replay_source: ReplaySource | None = None
     _saved_blocks: SavedBlocks | None = None
+    _waiting = False
 
     # --- the replay buffer ------------------------------------------------------------------------------------------
 
@@ -185,6 +186,20 @@ class ReplayData(OffPolicyAlgorithm):
                 f"because {wrapper}: wrap the environments as before, or leave the buffer out."
             )
         buffer.holds_normalised = normalised  # type: ignore[attr-defined]
+
+    def _waits_for_an_episode(self) -> bool:
+        """Whether there is no whole episode to learn from yet, with a warning. (In a full buffer, that is an error.)"""
+        buffer = self.replay_buffer
+        assert buffer is not None
+        waits = buffer.size() > 0 and not buffer.full and not holds_a_batch(buffer)
+        if waits and not self._waiting:
+            warnings.warn(
+                "There are no gradient steps until the first episode has ended, although "
+                f"learning_starts={self.learning_starts} is over: {type(buffer).__name__} samples whole episodes.",
+                stacklevel=3,
+            )
+        self._waiting = waits
+        return waits
 
     # --- checkpoints ------------------------------------------------------------------------------------------------
 

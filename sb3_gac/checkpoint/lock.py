@@ -10,6 +10,10 @@ except ImportError:  # Windows has no such locks
     fcntl = None  # type: ignore[assignment]
 
 
+class InUseError(RuntimeError):
+    """Another process has the directory."""
+
+
 @contextmanager
 def locked(directory: Path, file: str = "lock") -> Iterator[None]:
     """
@@ -20,14 +24,14 @@ def locked(directory: Path, file: str = "lock") -> Iterator[None]:
 
     :param directory: directory of the run
     :param file: name of the file in the directory that carries the lock; it is made if there is none, and is left as it is
-    :raises RuntimeError: if another process is making the run
+    :raises InUseError: if another process is making the run
     """
     with (directory / file).open("a") as held:
         if fcntl is not None:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise RuntimeError(f"Another process is running {directory}.") from None
+                raise InUseError(f"Another process is running {directory}.") from None
             except OSError:  # the file system has no locks
                 pass
         try:

@@ -1,6 +1,5 @@
 """Checks of ``policy_kwargs`` and ``replay_buffer_kwargs``, which are handed on to the policy's class and the buffer's."""
 
-import difflib
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -9,6 +8,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from sb3_gac.checks.arguments import ArgumentCheck, check_switch, constructor_parameters
 from sb3_gac.checks.values import check_integer, check_type
+from sb3_gac.names import meant
 
 
 def _check_makes(name: str, value: Any, what: str) -> None:
@@ -73,7 +73,5 @@ def check_taken(argument: str, kind: type, given: Mapping[str, Any]) -> None:
     known = constructor_parameters(kind)
     for name in given:
         if name not in known:
-            close = difflib.get_close_matches(name, known, n=1)
-            meant = f' Is "{close[0]}" meant?' if close else ""
-            takes = ", ".join(known[3:])
-            raise TypeError(f'{argument} has "{name}", which is no argument of {kind.__name__}: it takes {takes}.{meant}')
+            takes = f"it takes {', '.join(known[3:])}.{meant(name, known, nearness=0.6)}"
+            raise TypeError(f'{argument} has "{name}", which is no argument of {kind.__name__}: {takes}')

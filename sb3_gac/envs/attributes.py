@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Mapping
 from copy import deepcopy
+from enum import Enum, auto
 from inspect import isclass, ismodule, isroutine
 from typing import Any
 
@@ -30,9 +31,9 @@ def attributes_of(env: gym.Env) -> tuple[dict[str, Any], list[str]]:
     drawn = [name for name in _DRAWN if hasattr(env, name)]
     names = [name for name in {**vars(env), **dict.fromkeys(drawn)} if not name.startswith(_OWN)]
     names = [name for name in names if name not in (*_LEFT_OUT, *_DRAWING)]
-    is_state = {name: _is_state(getattr(env, name), env) for name in names}
-    state = {name: getattr(env, name) for name in names if is_state[name]}
-    return deepcopy(state), [name for name in names if is_state[name] is None]
+    kinds = {name: _kind(getattr(env, name), env) for name in names}
+    state = {name: getattr(env, name) for name, kind in kinds.items() if kind is _Kind.HELD}
+    return deepcopy(state), [name for name, kind in kinds.items() if kind is _Kind.UNKNOWN]
 
 
 def arguments_of(env: gym.Env) -> dict[str, Any] | None:
@@ -43,7 +44,7 @@ def arguments_of(env: gym.Env) -> dict[str, Any] | None:
     """
     if env.spec is None:
         return None
-    return deepcopy({name: value for name, value in env.spec.kwargs.items() if _is_state(value, env)})
+    return deepcopy({name: value for name, value in env.spec.kwargs.items() if _kind(value, env) is _Kind.HELD})
 
 
 def restore_attributes(env: gym.Env, attributes: Mapping[str, Any], arguments: Mapping[str, Any] | None) -> None:
@@ -62,22 +63,36 @@ def restore_attributes(env: gym.Env, attributes: Mapping[str, Any], arguments: M
             setattr(env, name, value)
 
 
-def _is_state(value: Any, env: Any) -> bool | None:
-    """
-    Whether a value can be held: ``False`` if it need not be, as what does not change or belongs to MuJoCo, whose state is
-    kept apart; ``None`` if it can't be, and may change.
-    """
+class _Kind(Enum):
+    """What a checkpoint can do with a value."""
+
+    HELD = auto()
+    #: It does not change, or belongs to MuJoCo, whose state is kept apart
+    NOT_NEEDED = auto()
+    #: It may change, and can't be held
+    UNKNOWN = auto()
+
+
+def _kind(value: Any, env: Any) -> _Kind:
     if type(value) in _CONTAINERS:
-        parts = {_is_state(part, env) for part in (value.values() if isinstance(value, dict) else value)} or {True}
-        is_held = len(parts) == 1 and (not isinstance(value, dict) or all(isinstance(key, str) for key in value))
-        return parts.pop() if is_held else None
-    if isinstance(value, np.random.Generator):
-        return True if value is not env._np_random else None  # two names for one generator would become two generators
+        return _kind_of_parts(value, env)
+    if isinstance(value, np.random.Generator):  # two names for one generator would become two generators
+        return _Kind.UNKNOWN if value is env._np_random else _Kind.HELD
+    if isinstance(value, np.ndarray) and _is_view(value):
+        return _Kind.NOT_NEEDED
     if isinstance(value, np.ndarray):
-        return False if _is_view(value) else True if value.dtype != object else None
+        return _Kind.UNKNOWN if value.dtype == object else _Kind.HELD
     if type(value) in _SINGLE or isinstance(value, np.generic):
-        return True
-    return False if _is_fixed(value, env) else None
+        return _Kind.HELD
+    return _Kind.NOT_NEEDED if _is_fixed(value, env) else _Kind.UNKNOWN
+
+
+def _kind_of_parts(value: Any, env: Any) -> _Kind:
+    """The kind of all parts of a container; one whose parts differ, or whose keys JSON can't hold, is unknown."""
+    parts = value.values() if isinstance(value, dict) else value
+    kinds = {_kind(part, env) for part in parts} or {_Kind.HELD}
+    has_names = not isinstance(value, dict) or all(isinstance(key, str) for key in value)
+    return kinds.pop() if len(kinds) == 1 and has_names else _Kind.UNKNOWN
 
 
 def _is_view(array: np.ndarray) -> bool:

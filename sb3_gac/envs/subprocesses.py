@@ -7,6 +7,7 @@ since its version 1 gymnasium asks no installed package for environments.  So th
 the pickled description of a process names a function of this module, and to unpickle it imports this package.
 """
 
+import os
 from multiprocessing import get_all_start_methods, get_context
 from multiprocessing.process import BaseProcess
 from multiprocessing.reduction import ForkingPickler
@@ -26,3 +27,8 @@ def _description(process: BaseProcess) -> tuple[Any, ...]:
 def _blank(process_class: type[BaseProcess]) -> BaseProcess:
     """Make an empty process; the description names this function, so the new process imports this module to read it."""
     return process_class.__new__(process_class)
+
+
+def usable_processors() -> int:
+    """Number of processors that this process may use, which a cluster or a container may have limited."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

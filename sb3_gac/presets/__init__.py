@@ -26,8 +26,9 @@ from typing import Any
 import yaml
 from torch import nn, optim
 
-from sb3_gac.algorithms import ALGORITHMS, FAMILIES, algorithm_class, meant, name_of
+from sb3_gac.algorithms import ALGORITHMS, FAMILIES, algorithm_class, name_of
 from sb3_gac.envs.suites import shows_whole_state, task_named
+from sb3_gac.names import meant
 from sb3_gac.presets.noises import at_noise, defaults_of, merge
 
 DIRECTORY = Path(__file__).parent

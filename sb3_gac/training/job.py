@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_nor
 from sb3_gac import ExactCheckpointCallback, GuiderLearnerEvalCallback, SeededEvalCallback
 from sb3_gac.algorithms import algorithm_class
 from sb3_gac.checkpoint.files import checkpoints
-from sb3_gac.checkpoint.lock import locked
+from sb3_gac.checkpoint.lock import InUseError, locked
 from sb3_gac.deploy.statistics import STATISTICS
 from sb3_gac.envs.suites import suite_of
 from sb3_gac.presets import PRESETS
@@ -106,7 +106,7 @@ def _taken_up(options: Namespace, env: VecEnv, held: ExitStack) -> tuple[Path, A
     directory = options.resume
     try:
         held.enter_context(locked(directory, CONFIGURATION))
-    except RuntimeError as error:
+    except InUseError as error:
         raise ValueError(f"--resume: {error} Wait until that process has ended, or stop it.") from None
     check_unfinished(directory)  # again, for another process may have finished the run since the options were read
     goes_on = bool(checkpoints(directory / CHECKPOINTS))

@@ -1,6 +1,5 @@
 """Provenance of a run: commit, versions and machine."""
 
-import os
 import platform
 import subprocess
 from collections.abc import Sequence
@@ -9,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
+
+from sb3_gac.envs.subprocesses import usable_processors
 
 PACKAGE = Path(__file__).resolve().parents[1]
 PACKAGES = ("sb3_gac", "stable-baselines3", "torch", "numpy", "gymnasium", "mujoco")
@@ -24,7 +25,7 @@ def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
     return {
         "commit": commit(),
         "versions": {"python": platform.python_version(), **_versions((*PACKAGES, *packages))},
-        "cpus": os.cpu_count(),
+        "cpus": usable_processors(),
         "threads": th.get_num_threads(),
     }
 

@@ -1,5 +1,6 @@
 """Evaluation of guider and learner: same seeds, what is logged and saved, and the three warnings."""
 
+import json
 import os
 import re
 import warnings
@@ -429,6 +430,17 @@ def test_a_worse_model_does_not_replace_the_best_one_after_a_resume(tmp_path):
     resumed.learn(resumed.steps_left, reset_num_timesteps=False, callback=callback)
     assert callback.best_mean_reward == 1e6
     assert not (tmp_path / "best_model.zip").exists()
+
+
+def test_evaluations_in_a_row_are_counted_on_after_a_resume():
+    before, after = (GuiderLearnerEvalCallback(_vec_env(), patience=3) for _ in range(2))
+    before._in_a_row["gap"], before._watched["train/kl"] = 2, 0.5
+    before._since_evaluation["train/kl"] = [0.25, np.float64(0.75)]
+    after.restore_checkpoint_state(json.loads(json.dumps(before.checkpoint_state())))
+    assert (after._in_a_row, after._watched) == ({"kl": 0, "bound": 0, "gap": 2}, {"train/kl": 0.5})
+    assert after._since_evaluation == {"train/kl": [0.25, 0.75]}
+    after.restore_checkpoint_state({"history": [{"timesteps": 5, "learner": 1.0}]})  # of an earlier version
+    assert after.history == [{"timesteps": 5, "learner": 1.0}]
 
 
 def test_a_new_training_starts_its_files_anew(tmp_path):

@@ -20,6 +20,7 @@ from benchmarks.config import first_gradient_step, reads_partial_alone
 from benchmarks.headroom import worth
 from benchmarks.run import run
 from benchmarks.suite import RunSpec, cells_of, read_suite
+from sb3_gac.checkpoint.lock import locked
 
 SPLIT = "sb3_gac.envs:SplitObservation: {partial: [0, 1], privileged: [2]}"
 SMALL = "{learning_starts: 20, batch_size: 4, gradient_steps: 1, policy_kwargs: {net_arch: [4]}}"
@@ -270,6 +271,26 @@ def test_a_comparison_that_is_refused_leaves_an_earlier_one_as_it_was(engine, mo
     with pytest.raises(SystemExit, match=r"unfinished run with other settings under \['run', 'arguments'\]"):
         _compare(monkeypatch, *SHORT, "--seeds", 1, "--algorithms", "sac", "--overrides", SMALL.replace("20", "30"))
     assert {path: path.read_bytes() for path in there.iterdir() if path.is_file()} == before
+
+
+def test_a_second_comparison_in_the_same_directory_is_refused(engine, monkeypatch, tmp_path):
+    runs = tmp_path / "comparisons/Pendulum-v1/runs"
+    runs.mkdir(parents=True)
+    with locked(runs), pytest.raises(SystemExit, match=r"Another process is running .*runs"):
+        _compare(monkeypatch, *SHORT, "--seeds", 1, "--algorithms", "sac")
+    assert not (runs.parent / "suite.yml").exists()
+    assert engine.made == 0
+
+
+@pytest.mark.parametrize("error", [ImportError("--engine ray needs ray"), ConnectionError("no cluster")])
+def test_a_cluster_that_is_not_there_leaves_nothing_behind(error, engine, monkeypatch, tmp_path):
+    def no_engine(address):
+        raise error
+
+    monkeypatch.setattr(launch, "RayEngine", no_engine)
+    with pytest.raises(SystemExit, match=str(error)):
+        _compare(monkeypatch, *SHORT, "--seeds", 1, "--algorithms", "sac", "--ray", "auto")
+    assert not (tmp_path / "comparisons").exists()
 
 
 @pytest.mark.parametrize(("steps", "overrides"), [(80, "{}"), (2_000, "{}"), (60, "{learning_starts: 60}")])

@@ -76,10 +76,10 @@ def test_steps_of_needed_runs_are_told_wherever_the_algorithm_is(tmp_path):
     (tmp_path / "results.json").write_text("{}")
     shown = page(tidy, found, "command", tmp_path / "results.json", 400)
     assert "tgrl, after 20,000 steps of needed runs" in shown
-    assert "400 environment steps each, beside those of the runs that it needs." in shown
+    assert "400 environment steps each (tgrl, after 20,000 steps of needed runs)." in shown
     without = tidy[tidy.algorithm == "sac-asym"]
     shown = page(without, worth(without, RANDOM, DEPLOYABLE), "command", tmp_path / "results.json", 400)
-    assert "beside those of the runs" not in shown
+    assert "of needed runs" not in shown
 
 
 def test_harm_is_told():

@@ -129,7 +129,7 @@ def test_infos_and_options_of_the_task_are_passed_on(stand_in):
 
 
 def test_threads_are_what_torch_leaves_and_too_many_are_named(stand_in, monkeypatch):
-    monkeypatch.setattr("sb3_gac.envs.vector.envpool.os.sched_getaffinity", lambda _: set(range(4)), raising=False)
+    monkeypatch.setattr("sb3_gac.envs.subprocesses.os.sched_getaffinity", lambda _: set(range(4)), raising=False)
     assert EnvPoolVecEnv("Walk-v1", 8, **SPLIT).num_threads == 3
     assert EnvPoolVecEnv("Walk-v1", 2, **SPLIT).num_threads == 2
     with pytest.warns(UserWarning, match="4 threads of EnvPool and 1 of torch are more than the 4 cores"):

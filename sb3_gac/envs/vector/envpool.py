@@ -5,7 +5,6 @@ EnvPool has MuJoCo Playground, DeepMind control, gymnasium's MuJoCo, MetaWorld a
 ``envpool.list_all_envs()`` names all tasks.
 """
 
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
@@ -18,6 +17,7 @@ from gymnasium import spaces
 from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.selections import Indices, KeySelection
 from sb3_gac.envs.state import NotRestorableError
+from sb3_gac.envs.subprocesses import usable_processors
 from sb3_gac.envs.suites.extras import import_extra
 from sb3_gac.envs.vector.base import BatchStep, BatchVecEnv, SimulatorObservation
 
@@ -153,8 +153,7 @@ def _in_order(observation: Any, order: np.ndarray) -> SimulatorObservation:
 
 
 def _threads(given: int | None, n_envs: int) -> int:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    of_torch = th.get_num_threads()
+    cores, of_torch = usable_processors(), th.get_num_threads()
     number = max(1, min(n_envs, cores - of_torch)) if given is None else check_count("num_threads", given)
     if number + of_torch > cores > 1:
         warnings.warn(
