@@ -51,8 +51,8 @@ def test_goal_environments(algorithm):
 
 
 def test_gradient_steps_wait_for_the_first_episode():
-    """The warm-up of four environments ends before any of their episodes does."""
-    goals = make_vec_env(lambda: _env(max_steps=20), n_envs=4)
+    """The warm-up of four environments ends before any of their episodes does, none of which finds 20 bits by chance."""
+    goals = make_vec_env(lambda: BitFlippingEnv(n_bits=20, continuous=True, max_steps=20), n_envs=4)
     model = _make("gac", goals, learning_starts=8)
     with pytest.warns(UserWarning, match=r"no gradient steps until .* learning_starts=8 is over: HerReplayBuffer"):
         model.learn(200)
