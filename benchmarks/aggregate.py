@@ -277,11 +277,12 @@ def origins(runs: list[FinishedRun]) -> dict[str, Any]:
     check_same_settings(runs)
     made_with = _distinct([origin for run in runs for origin in run.origins])
     seconds = [run.seconds for run in runs if run.seconds is not None]
+    cpus = {run.cpus for run in runs}
     particulars = {kind_of(run.spec): found for run in runs if (found := particulars_of(run.spec))}
     return {
         "made_with": made_with,
         "mixed_runs": [run.name for run in runs if len(run.origins) > 1],
-        "cpus": runs[0].cpus,
+        "cpus": max(cpus),
         "hours": round(sum(seconds) / 3600, 2),
         "timed_runs": len(seconds),
         "seconds_per_run": {"median": round(float(np.median(seconds)), 1), "max": round(max(seconds), 1)} if seconds else {},
@@ -290,7 +291,11 @@ def origins(runs: list[FinishedRun]) -> dict[str, Any]:
         "normalize": {kind_of(run.spec): run.normalize for run in runs if run.normalize is not None},
         **({"particulars": particulars} if particulars else {}),
         "runs": {
-            run.name: {"seconds": run.seconds, "made_with": [made_with.index(origin) for origin in run.origins]}
+            run.name: {
+                "seconds": run.seconds,
+                "made_with": [made_with.index(origin) for origin in run.origins],
+                **({"cpus": run.cpus} if len(cpus) > 1 else {}),
+            }
             for run in runs
         },
     }

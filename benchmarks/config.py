@@ -6,9 +6,12 @@ first for ``all`` algorithms, then for the families and classes from which the a
 and the algorithm's own arguments.
 """
 
+import json
 import traceback
 import warnings
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from hashlib import sha256
 from typing import Any
 
 from stable_baselines3.common.logger import Logger
@@ -283,6 +286,16 @@ def _present(where: str, kind: type, given: Mapping[str, Any]) -> dict[str, Any]
         (now,) = present_names(kind, {former: None}, None)
         warnings.warn(f'{where}: "{former}" is "{now}" now.', FutureWarning, stacklevel=3)  # a suite's author sees it
     return present
+
+
+def fingerprint(spec: RunSpec) -> str:
+    """
+    :param spec: settings of a run
+    :return: eight hexadecimal digits that change with any setting of the run, any argument of its algorithm, and its
+        normalisation
+    """
+    made_of = [asdict(spec), resolve(spec)[1], normalization(spec)]
+    return sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()[:8]
 
 
 def in_present_names(kind: type, arguments: Mapping[str, Any]) -> dict[str, Any]:

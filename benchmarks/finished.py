@@ -260,6 +260,7 @@ def record_of(run: FinishedRun) -> dict[str, Any]:
     rows = run.evaluations.astype(object)
     return {
         "seconds": run.seconds,
+        "cpus": run.cpus,
         "origins": run.origins,
         "arguments": run.arguments,
         "particulars": particulars_of(run.spec),
@@ -277,6 +278,7 @@ def _record_of(spec: RunSpec, results: Mapping[str, Any]) -> Mapping[str, Any] |
     of_run = results["runs"][name]
     return {
         "seconds": of_run["seconds"],
+        **({"cpus": of_run["cpus"]} if "cpus" in of_run else {}),  # where the machines of the runs differ
         "origins": [results["made_with"][index] for index in of_run["made_with"]],
         "arguments": results["arguments"][kind],
         "particulars": results.get("particulars", {}).get(kind, {}),
@@ -307,4 +309,6 @@ def _recorded(spec: RunSpec, record: Mapping[str, Any], evaluations: Mapping[Any
     else:
         rows = evaluations[tuple(names_of(spec).values())].drop(columns=NAMES).dropna(axis=1, how="all")
     arguments = _recorded_arguments(spec, record["arguments"])
-    return FinishedRun(spec, rows, arguments, record["origins"], record["seconds"], cpus, record["normalize"])
+    return FinishedRun(
+        spec, rows, arguments, record["origins"], record["seconds"], record.get("cpus", cpus), record["normalize"]
+    )

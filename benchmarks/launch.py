@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from benchmarks.config import check_programs, check_runs, check_simulators
+from benchmarks.config import check_programs, check_runs, check_simulators, fingerprint
 from benchmarks.engines import Engine, LocalEngine, RayEngine
 from benchmarks.finished import add_reuse_options, is_finished, name_of, read_reused
 from benchmarks.jobs import Clock, Job, reason_in
@@ -81,7 +81,7 @@ def _add_job(
 
     :param jobs: run's name -> job, to which the jobs are added
     :param spec: settings of the run
-    :param command: function that makes the command of a run, from its name and the arguments that lead to it from a run of
+    :param command: function that makes the command of a run, from its settings and the arguments that lead to it from a run of
         the suite
     :param runs: directory of all runs
     :param needed: arguments that lead from a run of the suite to this one, empty for a run of the suite itself
@@ -94,7 +94,7 @@ def _add_job(
             for argument, other in needed_runs(spec).items()
             if not _has_left(argument, other, runs)
         ]
-        jobs[name] = Job(spec, spec.directory(runs), command(name, needed), needs=needs)
+        jobs[name] = Job(spec, spec.directory(runs), command(spec, needed), needs=needs)
     return jobs[name]
 
 
@@ -103,17 +103,17 @@ def _has_left(argument: str, spec: RunSpec, runs: Path) -> bool:
     return is_finished(spec, runs) and file_for(argument, spec, runs).exists()
 
 
-def run_command(suite: Path, index: int, runs: Path, name: str, needed: Sequence[str] = ()) -> list[str]:
+def run_command(suite: Path, index: int, runs: Path, spec: RunSpec, needed: Sequence[str] = ()) -> list[str]:
     """
     :param suite: YAML file of the suite
     :param index: index of the run in the suite
     :param runs: directory of all runs
-    :param name: name of the run to make, since another process may change the suite before this one starts
+    :param spec: settings of the run to make, since another process may change the suite before this one starts
     :param needed: arguments that lead from this run to a run that it needs, empty for the run itself
     :return: words of the command that makes the run, or the run that it needs
     """
     command = [sys.executable, "-m", "benchmarks.run", "--suite", str(suite), "--index", str(index), "--runs", str(runs)]
-    return [*command, "--expect", name, *(["--needed", *needed] if needed else [])]
+    return [*command, "--expect", name_of(spec), fingerprint(spec), *(["--needed", *needed] if needed else [])]
 
 
 def launch_one(job: Job, retries: int, engine: Engine, tell: Callable[[Job], None]) -> None:

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_gac
 from benchmarks.checkpoint import TIMING, checkpoints_of, read_seconds, write_atomically, write_timing
-from benchmarks.config import POLICY, in_present_names, normalization, resolve, settings_in_present_names
+from benchmarks.config import POLICY, fingerprint, in_present_names, normalization, resolve, settings_in_present_names
 from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.external import Program
 from benchmarks.finished import is_finished, name_of
@@ -266,7 +266,10 @@ def main() -> None:
         help="not that run, but the one whose model it needs as this argument",
     )
     parser.add_argument(
-        "--expect", metavar="NAME", help="name that the run must have; launch gives it, because a suite may change meanwhile"
+        "--expect",
+        nargs=2,
+        metavar=("NAME", "FINGERPRINT"),
+        help="what the run must be; launch gives it, because a suite may change meanwhile",
     )
     options = parser.parse_args()
     try:
@@ -274,6 +277,8 @@ def main() -> None:
     except (ValueError, OSError) as error:
         sys.exit(str(error))
     if not 0 <= options.index < len(specs):
+        if options.expect:
+            sys.exit(_changed(options.suite, f"{options.expect[0]} was run {options.index}, and there are {len(specs)} now"))
         sys.exit(f"--index: {options.suite} has runs from 0 to {len(specs) - 1}, got {options.index}.")
     spec = specs[options.index]
     for argument in options.needed:
@@ -282,9 +287,23 @@ def main() -> None:
             named = f"it needs runs as {sorted(needed)}" if needed else "it needs no other run"
             sys.exit(f"--needed: {spec.algorithm} needs no run as {argument!r}; {named}.")
         spec = needed[argument]
-    if options.expect not in (None, found := name_of(spec)):
-        sys.exit(f"{options.suite} has changed since the launch began: in place of {options.expect} it has {found} there.")
+    _refuse_another(spec, options.suite, options.expect)
     print(run(spec, options.runs, progress_bar=sys.stderr.isatty()))
+
+
+def _refuse_another(spec: RunSpec, suite: Path, expected: tuple[str, str] | None) -> None:
+    """End the process if this is another run than the one of this name and fingerprint."""
+    if expected is None:
+        return
+    name, digits = expected
+    if (found := name_of(spec)) != name:
+        sys.exit(_changed(suite, f"in place of {name} it has {found} there"))
+    if fingerprint(spec) != digits:
+        sys.exit(_changed(suite, f"{name} has other settings or arguments now"))
+
+
+def _changed(suite: Path, how: str) -> str:
+    return f"{suite}, or a file that it names, has changed since the launch began: {how}. Launch the suite anew."
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,10 +18,11 @@ import benchmarks.run
 from benchmarks import launch
 from benchmarks.config import check_simulators
 from benchmarks.engines import run_process
+from benchmarks.finished import name_of
 from benchmarks.jobs import Clock, count, reason_in
 from benchmarks.launch import launch_one
 from benchmarks.overview import line
-from benchmarks.suite import RunSpec
+from benchmarks.suite import RunSpec, read_suite
 from sb3_gac.envs.suites import SUITES
 from tests.benchmarks.helpers import evaluated, jobs_in
 
@@ -110,16 +112,32 @@ def test_a_process_has_the_folder_of_who_starts_it_and_finds_the_benchmarks(tmp_
     assert status == 0, log.read_text()
 
 
-def test_a_run_that_the_suite_has_no_longer_in_its_place_is_not_made(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("index", "changes", "said"),
+    [
+        (0, {"task": "Elsewhere", "environment": {"id": "Pendulum-v1"}}, "in place of {name} it has "),
+        (0, {"eval_episodes": 99}, "{name} has other settings or arguments now"),
+        (0, {"overrides": {"compile": True}}, "{name} has other settings or arguments now"),
+        (0, {"definition": {"class": "gac", "normalize": {"clip_obs": 7.0}}}, "{name} has other settings or arguments now"),
+        (1000, {}, "{name} was run 1000, and there are "),
+    ],
+)
+def test_a_run_that_the_suite_has_no_longer_in_its_place_is_not_made(tmp_path, monkeypatch, index, changes, said):
     monkeypatch.setattr(benchmarks.run, "run", lambda *_, **__: pytest.fail("another run was made"))
-    command = launch.run_command(
-        Path(benchmarks.run.__file__).parent / "suites/smoke.yml", 0, tmp_path, "small-600/Elsewhere/gac/seed0"
-    )
-    monkeypatch.setattr(sys, "argv", command[2:])
-    with pytest.raises(
-        SystemExit, match="has changed since the launch began: in place of small-600/Elsewhere/gac/seed0 it has"
-    ):
+    spec = replace(read_suite(SMOKE)[0], **changes)
+    monkeypatch.setattr(sys, "argv", launch.run_command(SMOKE, index, tmp_path, spec)[2:])
+    with pytest.raises(SystemExit) as end:
         benchmarks.run.main()
+    assert f"has changed since the launch began: {said.format(name=name_of(spec))}" in str(end.value)
+
+
+def test_the_run_that_a_launch_expects_is_made(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(benchmarks.run, "run", lambda spec, *_, **__: made.append(spec))
+    spec = read_suite(SMOKE)[1]
+    monkeypatch.setattr(sys, "argv", launch.run_command(SMOKE, 1, tmp_path, spec)[2:])
+    benchmarks.run.main()
+    assert made == [spec]
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ import benchmarks.launch
 import benchmarks.report
 import benchmarks.run
 from benchmarks.aggregate import finished_runs
+from benchmarks.config import fingerprint
 from benchmarks.finished import name_of
 from benchmarks.jobs import Job, count
 from benchmarks.launch import in_order, jobs_left, launch, run_command
@@ -182,7 +183,7 @@ def launched(tmp_path_factory):
 
 def test_launch_runs_what_is_needed_and_hands_on_its_model(launched):
     path, runs, commands = launched
-    teacher, student, other = map(name_of, (needed_runs(read_suite(path)[0])["teacher"], *read_suite(path)))
+    teacher, student, other = needed_runs(read_suite(path)[0])["teacher"], *read_suite(path)
     assert commands == [
         run_command(path, 0, runs, teacher, ["teacher"]),
         run_command(path, 0, runs, student),
@@ -264,11 +265,14 @@ def test_what_a_failed_run_was_needed_for_is_not_started_and_says_why(tmp_path, 
         benchmarks.launch.main()
     assert end.value.code == 1
     failing, bereft, orphaned = (f"small-60/Pendulum-noise0.1/{name}/seed0" for name in ("failing", "bereft", "orphaned"))
+    first, second = read_suite(path)
+    innermost = needed_runs(needed_runs(first)["teacher"])["teacher"]
+    assert name_of(innermost) == failing
     runs = ["--runs", str(tmp_path / "runs"), "--expect"]
     assert [command[command.index("--index") + 1 :] for command in engine.ran] == [
-        ["0", *runs, failing, "--needed", "teacher", "teacher"],
-        ["0", *runs, failing, "--needed", "teacher", "teacher"],
-        ["1", *runs, "small-60/Pendulum-noise0.1/sac-asym/seed0"],
+        ["0", *runs, failing, fingerprint(innermost), "--needed", "teacher", "teacher"],
+        ["0", *runs, failing, fingerprint(innermost), "--needed", "teacher", "teacher"],
+        ["1", *runs, "small-60/Pendulum-noise0.1/sac-asym/seed0", fingerprint(second)],
     ]
     said = capsys.readouterr().out
     assert f"{bereft}: not started, for it needs {failing}, which failed (" in said

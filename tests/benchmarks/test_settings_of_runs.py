@@ -177,6 +177,21 @@ def test_results_record_normalisation_and_count_for_the_same_one_alone(tmp_path)
         assert len(read_results(tmp_path / "made", specs)) == counted, "what was not recorded is no other value"
 
 
+def test_each_run_of_several_machines_has_its_number_of_processors(tmp_path):
+    suite = _suite(tmp_path, CELL, CELL | {"noises": [0.2]})
+    specs, cpus = read_suite(suite), [2, 2, 16, 2, 2, 8, 4]
+    for spec, number in zip(specs, cpus, strict=False):
+        _finish(spec, tmp_path / "runs", lambda one, number=number: one.update(cpus=number))
+    record = _aggregate(suite, tmp_path / "runs", tmp_path / "made", "--complete-cells")
+    assert record["cpus"] == 16
+    assert [run["cpus"] for run in (record["runs"] | record["set_aside"]).values()] == cpus
+    found = read_results(tmp_path / "made", specs)
+    assert [found[name_of(spec)].cpus for spec in specs[:-1]] == cpus
+    same = {"runs": {name: {"seconds": 1.0, "made_with": [0]} for name in record["runs"]}, "cpus": 3}
+    (tmp_path / "made.json").write_text(json.dumps(record | same))
+    assert {run.cpus for run in list(read_results(tmp_path / "made", specs[:4]).values())} == {3}
+
+
 def test_the_page_tells_normalisation_and_needed_runs_apart():
     kinds = [f"{name}, Hopper, noise 0.1" for name in ("gpo", "taught")]
     results = {
