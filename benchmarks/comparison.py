@@ -21,6 +21,7 @@ from benchmarks.comparison_page import page
 from benchmarks.config import check_programs, check_runs, check_simulators, first_gradient_step, reads_partial_alone
 from benchmarks.environments import EVAL_SEED, environment, make_envs
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, worth
+from benchmarks.own_code import about_changed_code, code_of
 from benchmarks.run import check_unfinished
 from benchmarks.suite import NAME, RunSpec, cells_of, default_name, read_definitions
 from benchmarks.tidy import file_of, read_tidy
@@ -206,7 +207,7 @@ def run(options: argparse.Namespace) -> Path:
     with locked(runs):  # another comparison would make this one's processes read another suite
         suite = write_suite(options)  # after all checks: a comparison that is refused leaves an earlier one as it was
         left = f"{counted(len(jobs), 'run')} of {options.steps:,} steps to do"
-        print(f"{left}, {finished} done; all is in {options.out}.", flush=True)
+        print("\n".join([f"{left}, {finished} done; all is in {options.out}.", *about_changed_code(specs, runs)]), flush=True)
         launch.launch(jobs, options.jobs or engine.cpus, 1, engine, finished)
         if failed := [job for job in jobs if job.state == "failed"]:
             logs = "\n".join(f"  {job.log}: {job.reason}" for job in failed)
@@ -274,6 +275,7 @@ def untrained_returns(spec: RunSpec, path: Path) -> dict[str, np.ndarray]:
     """
     wrappers = spec.environment["wrappers"] if spec.environment else []
     what = {"environment": environment(spec), "wrappers": wrappers, "episodes": [UNTRAINED_EPISODES, spec.eval_episodes]}
+    what |= code_of(spec)
     recorded = json.loads(json.dumps(what, default=str))
     try:
         known = json.loads(path.read_text())

@@ -32,6 +32,7 @@ from benchmarks.engines import Engine, LocalEngine, RayEngine
 from benchmarks.finished import add_reuse_options, is_finished, name_of, read_reused
 from benchmarks.jobs import Clock, Job, reason_in
 from benchmarks.overview import Overview, line, table, why_not_started
+from benchmarks.own_code import about_changed_code
 from benchmarks.run import file_for
 from benchmarks.suite import RUNS, RunSpec, needed_runs, read_suite
 
@@ -50,6 +51,8 @@ def jobs_left(suite: Path, runs: Path, reuse: Sequence[Path] = (), rerun: Sequen
     """
     specs = read_suite(suite)
     check_runs(suite.name, specs)
+    for sentence in about_changed_code(specs, runs):
+        print(sentence, file=sys.stderr)
     return jobs_of(specs, suite, runs, reuse, rerun)
 
 

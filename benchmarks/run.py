@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import yaml
@@ -27,6 +26,7 @@ from benchmarks.config import POLICY, fingerprint, in_present_names, normalizati
 from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.external import Program
 from benchmarks.finished import is_finished, name_of
+from benchmarks.own_code import code_of
 from benchmarks.program import read_rows, rows_as_text
 from benchmarks.suite import RUNS, UNSAID, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.base.recording import holds_every_step
@@ -120,9 +120,7 @@ def _comparable(algorithm_class: type, configuration: dict[str, Any]) -> dict[st
     return {**configuration, "run": UNSAID | run, "arguments": arguments}
 
 
-def _write_configuration(
-    path: Path, configuration: dict[str, Any], resumed: bool, versions: Mapping[str, str] = MappingProxyType({})
-) -> None:
+def _write_configuration(path: Path, configuration: dict[str, Any], resumed: bool, versions: Mapping[str, str]) -> None:
     """
     Write the configuration with the commit and the versions of this process. If this process goes on with a run, those of the
     earlier processes are kept wherever they differ.
@@ -130,7 +128,7 @@ def _write_configuration(
     :param path: YAML file of the configuration
     :param configuration: settings of the run and arguments of its algorithm
     :param resumed: whether an earlier process began this run
-    :param versions: package -> version, of a program that trains in a process of its own
+    :param versions: what the run needs beside our packages -> its version
     """
     now = provenance()
     now["versions"] = {**now["versions"], **versions}
@@ -200,7 +198,7 @@ def _train(
     checkpoints = checkpoints_of(algorithm_class, directory)
     arguments = {"policy": POLICY, **instantiate(configuration["arguments"]), **models, "seed": spec.seed}
     resumed = checkpoints.resume(algorithm_class, arguments, env, spec.seed)
-    _write_configuration(directory / CONFIGURATION, configuration, resumed=resumed is not None)
+    _write_configuration(directory / CONFIGURATION, configuration, resumed is not None, code_of(spec))
     stopwatch = Stopwatch(directory / TIMING, evaluation, resumed=resumed is not None)
     if resumed is None:
         model = algorithm_class(env=env, device="cpu", **arguments)
@@ -231,7 +229,7 @@ def _run_program(spec: RunSpec, directory: Path, program: Program, configuration
     :return: one row for each evaluation
     """
     resumed = bool(read_rows(directory))
-    _write_configuration(directory / CONFIGURATION, configuration, resumed, program.versions())
+    _write_configuration(directory / CONFIGURATION, configuration, resumed, {**code_of(spec), **program.versions()})
     return program.run(spec, directory)
 
 

@@ -87,8 +87,8 @@ class InProcess:
         self.made = 0
 
     def run(self, command, log):
-        options = dict(zip(command[3::2], command[4::2], strict=True))
-        run(read_suite(Path(options["--suite"]))[int(options["--index"])], Path(options["--runs"]))
+        suite, index, runs = (command[command.index(name) + 1] for name in ("--suite", "--index", "--runs"))
+        run(read_suite(Path(suite))[int(index)], Path(runs))
         self.made += 1
         return 0
 
@@ -219,7 +219,7 @@ def test_gradient_steps_are_compiled_where_it_pays(monkeypatch):
     assert "compile" not in _suite("--env", "m:make")["overrides"]
 
 
-def test_a_function_that_makes_an_environment(engine, monkeypatch, tmp_path):
+def test_a_function_that_makes_an_environment(engine, monkeypatch, tmp_path, capsys):
     (tmp_path / "my_own_envs.py").write_text(MODULE)
     monkeypatch.syspath_prepend(tmp_path)
     arguments = [word if word != "Pendulum-v1" else "my_own_envs:make_env" for word in SHORT]
@@ -227,6 +227,11 @@ def test_a_function_that_makes_an_environment(engine, monkeypatch, tmp_path):
     suite = yaml.safe_load((tmp_path / "comparisons" / "make_env" / "suite.yml").read_text())
     assert suite["cells"][0]["env_kwargs"] == {"torque": 1.0}
     assert engine.made == 1
+    assert "has changed" not in capsys.readouterr().out
+    (tmp_path / "my_own_envs.py").write_text(MODULE.replace("max_torque", "max_speed"))
+    _compare(monkeypatch, *arguments, "--env-kwargs", "{torque: 1.0}", "--algorithms", "sac", "--seeds", 1)
+    assert engine.made == 1
+    assert "The code of my_own_envs has changed since 1 of the runs in " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
