@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping
+from copy import deepcopy
 from os import PathLike
 from typing import Any, ClassVar
 
@@ -291,7 +292,9 @@ class AsymmetricAlgorithm(
         parameters = load_path_or_dict
         if not isinstance(parameters, dict):
             _, parameters, _ = load_from_zip_file(parameters, device=device, load_data=False)
-        parameters = dict(parameters)
+        parameters = {  # torch's optimisers keep the tensors of a state that they load, and another model may have them
+            name: deepcopy(state) if "optimizer" in name else state for name, state in parameters.items()
+        }
         for role, network in self.policy.trained.items():
             name = f"policy.{role}.optimizer"
             if name in parameters:

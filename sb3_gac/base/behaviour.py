@@ -102,11 +102,15 @@ class Behaviour:
         :param progress_remaining: fraction of training that remains, from 1 to 0
         :return: role of the policy that acts now in each environment
         """
-        if not self.shares or not episode_start.any():
-            return list(acting) if self.shares else [self.default] * len(episode_start)
-        shares = self.shares_at(progress_remaining)
+        if not episode_start.any():
+            return list(acting)
         n_envs = len(episode_start)
-        chosen = self._drawn(shares, np.random.rand(n_envs)) if self.per == "episode" else self._parts(shares, n_envs)
+        if not self.shares:
+            chosen = [self.default] * n_envs
+        elif self.per == "episode":
+            chosen = self._drawn(self.shares_at(progress_remaining), np.random.rand(n_envs))
+        else:
+            chosen = self._parts(self.shares_at(progress_remaining), n_envs)
         return [new if starts else old for new, old, starts in zip(chosen, acting, episode_start, strict=True)]
 
     def _parts(self, shares: Mapping[str, float], n_envs: int) -> list[str]:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_gac.base.behaviour import Behaviour
 from sb3_gac.base.hooks import EpisodeHooks
 
 
@@ -33,6 +34,13 @@ class ReturnComparison(EpisodeHooks):
         """
         self.compare_every, self.window = compare_every, window
         self.returns, self.next_comparison = {first: [], second: []}, compare_every
+
+    def idle_policies(self, behaviour: Behaviour) -> list[str]:
+        """
+        :param behaviour: shares of the policies in the data
+        :return: roles of those of the two policies that never act, so that there would be no comparison
+        """
+        return [role for role in self.returns if not behaviour.acts(role)]
 
     @abstractmethod
     def compare(self, difference: float) -> None:

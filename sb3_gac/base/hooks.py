@@ -27,7 +27,8 @@ class EpisodeHooks(BaseAlgorithm):
 
         :param env: index of the environment
         :param episode_return: sum of the episode's rewards before normalisation
-        :param role: role of the policy that acted in the episode; ``None`` if some actions were the warm-up's or a recording's
+        :param role: role of the policy that acted in the episode; ``None`` if some actions were the warm-up's, a recording's
+            or those of a former phase of training
         """
 
     def begin_episodes(self, n_envs: int) -> None:

@@ -193,14 +193,16 @@ def resolve_update_every(roles: Roles, policy_delay: int, update_every: Mapping[
     :param roles: roles of the algorithm
     :param policy_delay: number of gradient steps for each step of a policy's network
     :param update_every: role, or "critic" for all critics -> number of gradient steps for each step of its network; by
-        default ``policy_delay`` for policies and 1 for all others
+        default ``policy_delay`` for policies and 1 for all others. A policy whose layers are those of other networks has
+        steps as often as they have
     :return: role -> number of gradient steps, for all roles
     :raises ValueError: if a role is unknown or a number is no integer above 0
     """
     given = _check_roles("update_every", roles.all, update_every or {})
     for role, every in given.items():
         check_integer(f'update_every["{role}"]', every, 1)
-    return dict.fromkeys(roles.all, 1) | dict.fromkeys(roles.policies, policy_delay) | _for_each_role(roles, given)
+    delayed = [role for role in roles.policies if role not in roles.tied]
+    return dict.fromkeys(roles.all, 1) | dict.fromkeys(delayed, policy_delay) | _for_each_role(roles, given)
 
 
 def resolve_rnn_types(

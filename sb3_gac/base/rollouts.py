@@ -1,6 +1,7 @@
 """The loop that collects rollouts: it stores each step that was taken, and no other, whoever stops or interrupts it."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,7 @@ class RolloutCollection(OnPolicyAlgorithm):
     check_minibatches: Callable[[int], None]
     call_hooks: Callable[[np.ndarray], None]
     follow_arguments: Callable[[], None]
+    _precision: Callable[[], AbstractContextManager]
 
     def _setup_model(self) -> None:
         """See SB3's ``_setup_model``; the policy is made without SB3's argument ``use_sde``."""
@@ -203,7 +205,8 @@ class RolloutCollection(OnPolicyAlgorithm):
             observations; log-probabilities of the draws
         """
         obs, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
-        distribution = self.policy.behaviour_distribution(obs)  # type: ignore[operator]
+        with self._precision():  # that of the losses, or rounding alone would move their ratios away from 1
+            distribution = self.policy.behaviour_distribution(obs)  # type: ignore[operator]
         drawn = distribution.draw()
         actions = distribution.action(drawn).cpu().numpy()
         if isinstance(self.action_space, spaces.Box):

@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_gac.base.batch import Batch, Loss, Metrics, Outputs
 from sb3_gac.base.compiling import AUTO
+from sb3_gac.base.frozen import FrozenPolicy
 from sb3_gac.base.policy import AsymmetricPolicy
 from sb3_gac.checks.divergence import check_finite_metrics
 from sb3_gac.math.losses import critic_loss, masked_mean
@@ -33,6 +34,7 @@ class GradientSteps(BaseAlgorithm):
     #: Arguments that are constants of a compiled update, which is compiled anew when one of them changes
     compiled_settings: ClassVar[tuple[str, ...]] = ("max_grad_norm", "mixed_precision")
     policy: AsymmetricPolicy
+    frozen: dict[str, FrozenPolicy]
     coefficients: dict[str, Coefficient]
     max_grad_norm: float | None
     mixed_precision: bool
@@ -58,7 +60,7 @@ class GradientSteps(BaseAlgorithm):
         One step of a network's optimiser down a loss, for which all other networks are constants.
 
         :param networks: name of a network, or names of several that share a loss, each with its own optimiser; the gradient
-            with respect to all of them is scaled to a norm of at most ``max_grad_norm``
+            with respect to all of them is scaled to a norm of at most ``max_grad_norm``. While the first one rests, all do
         :param loss: function of ``tensors`` that returns the loss and its metrics
         :param tensors: arguments of the loss, also in tuples or dicts: all that changes from step to step
         :return: name -> metric: the loss under the (first) network's name, the norm of each network's gradient, and the
@@ -71,7 +73,8 @@ class GradientSteps(BaseAlgorithm):
             value, metrics = loss(*tensors)
         metrics = {f"{names[0]}_loss": value, **metrics}
         metrics = {name: metric.detach() if metric.requires_grad else metric for name, metric in metrics.items()}
-        trained = {name: self.policy.trained[name] for name in names if name not in self._resting}
+        takes_steps = [] if names[0] in self._resting else [name for name in names if name not in self._resting]
+        trained = {name: self.policy.trained[name] for name in takes_steps}
         parameters = [parameter for network in trained.values() for parameter in network.parameters]
         gradients: Sequence[th.Tensor] = ()
         if parameters and value.requires_grad:
@@ -154,7 +157,8 @@ class GradientSteps(BaseAlgorithm):
         self.policy.refresh_parameters(self.compiles)
         self.refresh_schedules()
         settings = (getattr(self, name) for name in self.compiled_settings)
-        self.programs.settings = (self.policy, self.policy.optimizer_options, th.get_num_threads(), *settings)
+        constants = (self.policy, *self.frozen.values(), self.policy.optimizer_options, th.get_num_threads())
+        self.programs.settings = (*constants, *settings)
         history: list[Metrics] = []
         try:
             in_branches = self._branches_are_independent and not self.compiles and th.get_num_threads() > 1

@@ -158,6 +158,7 @@ class RMA(AsymmetricOffPolicyAlgorithm):
         before, self.phase = self.phase, 1 if self.num_timesteps < ends else 2
         if before < self.phase:
             self.replay_buffer.retire()  # type: ignore[union-attr]
+            self._has_warmed_up |= ~episode_start  # the episodes under way are neither policy's
         own = ["expert" if self.phase == 1 else "actor"] * len(episode_start)
         return own if self.behaviour is None else super().choose_acting(episode_start)
 

@@ -1,5 +1,6 @@
 """Teacher-Guided RL: an actor imitates a frozen teacher for as long as the imitation raises its return."""
 
+import warnings
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -116,6 +117,17 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         super()._check_arguments()
         if self.recording is not None:
             raise ValueError("TGRL compares its actors' episodes, but no actor acts on a recording: leave recording out.")
+        if self.n_steps != 1:
+            raise ValueError(
+                f"n_steps must be 1 for TGRL, got {self.n_steps}: its teacher_critic sums up the KL of every step, and "
+                "batches lack the observations in between."
+            )
+        if self.behaviour is not None and self.coef_step and (idle := self.idle_policies(self._make_behaviour())):
+            warnings.warn(
+                "The teacher's weight stays as it is, since TGRL compares episodes of actor and auxiliary, but behaviour "
+                f"gives none to {' and '.join(idle)}: give each a share, or leave behaviour out.",
+                stacklevel=2,
+            )
 
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The entropy temperature and the weight of the teacher."""

@@ -145,7 +145,7 @@ class GAC(GuidanceSigns, GuiderPrediction, AsymmetricOffPolicyAlgorithm):  # typ
                 'shared_std="learner" needs an entropy term in the learner\'s objective, or nothing keeps its std from '
                 'falling: leave shared_std "auto", or give GAC or GACShare learner_entropy=True.'
             )
-        if self.target_kl == "auto" and (self.recording or not all(map(self._make_behaviour().acts, self.returns))):
+        if self.target_kl == "auto" and (self.recording or self.idle_policies(self._make_behaviour())):
             raise ValueError(
                 'target_kl="auto" compares episodes of guider and learner, but one of the two never acts: give each a share, '
                 'as in behaviour={"learner": 0.25}, and no recording; or give a number for target_kl.'

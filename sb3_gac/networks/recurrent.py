@@ -133,7 +133,7 @@ class RecurrentCore(Memory):
         x = self.hidden(features.reshape(1, steps * batch, -1).expand(self.n_members, -1, -1))
         x = x.reshape(self.n_members, steps, batch, -1)
         if state is None:
-            state = features.new_zeros(self.n_members, batch, self.state_size)
+            state = features.new_zeros(self.n_members, batch, self.state_size, dtype=th.float32)
         unrolls: list[Any] = [cell.unroll for cell in self.cells]
         members = zip(unrolls, x.unbind(0), state.unbind(0), strict=True)
         results = [in_float32(functools.partial(unroll, state=before), inputs) for unroll, inputs, before in members]

@@ -145,6 +145,10 @@ class Programs(dict[tuple[Any, ...], Program]):
         #: Present values of what all functions depend on, beside their arguments
         self.settings: tuple[Any, ...] = ()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy has no programs: those of the original read, and train, the original's networks."""
+        return type(self), (self.setting_names,)
+
     def run(
         self,
         function: Callable[..., Any],

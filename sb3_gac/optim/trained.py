@@ -33,7 +33,9 @@ class TrainedParameters:
     ):
         self.everything = list(parameters)
         self.optimizer = optimizer
-        self._memory = {id(parameter) for parameter in memory}
+        of_memory = {id(parameter) for parameter in memory}
+        #: Whether each parameter belongs to the memory, by position: a copy of the network has other parameters
+        self._remembers = [id(parameter) in of_memory for parameter in self.everything]
         self._clips = [index < len(self.everything) - unclipped for index in range(len(self.everything))]
         self._state: object = None
         self.trained: list[bool] = []
@@ -86,7 +88,7 @@ class TrainedParameters:
         :param scale: multiple of the network's learning rate
         :raises ValueError: if the optimiser can have only one learning rate for all parameters
         """
-        if scale != 1 and self._memory and self.adam is None:
+        if scale != 1 and any(self._remembers) and self.adam is None:
             raise ValueError(
                 'lr_scales: a learning rate for "memory" goes with torch\'s Adam and AdamW, without amsgrad, foreach or '
                 f"fused=False, but the optimiser is {type(self.optimizer).__name__}: leave it out, or choose another "
@@ -106,16 +108,16 @@ class TrainedParameters:
     def _learning_rates(self) -> list[float]:
         """The learning rate of each of :meth:`_parts`."""
         group = self.optimizer.param_groups[0]
-        return [group["lr"], group["lr"] * group.get("memory_lr_scale", 1.0)][: 2 if self._memory else 1]
+        return [group["lr"], group["lr"] * group.get("memory_lr_scale", 1.0)][: 2 if any(self._remembers) else 1]
 
     def _parts(self, values: Sequence[T]) -> list[list[T]]:
         """
         :param values: one value for each trained parameter, in their order
         :return: the values of parameters outside of the memory and, if there is a memory, the values of its parameters
         """
-        if not self._memory:
+        if not any(self._remembers):
             return [list(values)]
-        remembers = [id(parameter) in self._memory for parameter in self.parameters]
+        remembers = [own for own, trained in zip(self._remembers, self.trained, strict=True) if trained]
         return [[v for v, own in zip(values, remembers, strict=True) if own is part] for part in (False, True)]
 
     def freeze_as_saved(self) -> None:

@@ -62,8 +62,8 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
     An episode can be sampled after it has ended, for any reason, as long as all of its steps are stored.
 
     :param args: positional arguments of :class:`CompactDictReplayBuffer`
-    :param sequence_length: number of transitions in a sample that losses count, drawn uniformly over steps; ``None`` for whole
-        episodes, drawn uniformly over episodes
+    :param sequence_length: largest number of transitions in a sample that losses count, less at an episode's start and end, so
+        that all steps are in equally many samples; ``None`` for whole episodes, drawn uniformly over episodes
     :param burn_in: largest number of transitions before these that only bring memories up to date
     :param kwargs: keyword arguments of :class:`CompactDictReplayBuffer`; ``n_steps`` must be 1
     """
@@ -167,13 +167,15 @@ class EpisodeReplayBuffer(CompactDictReplayBuffer):
         if self.sequence_length is None:
             envs, starts, lengths = episodes[np.random.randint(len(episodes), size=batch_size)].T
             return envs, starts, lengths, np.zeros_like(lengths)
-        ends = np.cumsum(episodes[:, 2])
+        # A window of sequence_length steps may begin before an episode and end after it, so that every step is in as many
+        ends = np.cumsum(episodes[:, 2] + self.sequence_length - 1)
         chosen = np.random.randint(ends[-1], size=batch_size)
         index = np.searchsorted(ends, chosen, side="right")
         envs, starts, lengths = episodes[index].T
-        offsets = chosen - (ends[index] - lengths)
+        window_ends = chosen - (ends[index] - lengths - self.sequence_length)  # from 1 to lengths + sequence_length - 1
+        offsets = np.maximum(window_ends - self.sequence_length, 0)
         burn_in = np.minimum(offsets, self.burn_in)
-        counted = np.minimum(lengths - offsets, self.sequence_length)
+        counted = np.minimum(window_ends, lengths) - offsets
         return envs, starts + offsets - burn_in, burn_in + counted, burn_in
 
     def _sequences(

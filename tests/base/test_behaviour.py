@@ -34,8 +34,9 @@ def test_shares_are_shares_of_episodes_drawn_anew_at_each_start():
 
 
 @pytest.mark.parametrize("per", ["episode", "environment"])
-def test_whoever_has_begun_an_episode_ends_it(per):
-    behaviour = Behaviour(ROLES, {"learner": 1.0}, per)
+@pytest.mark.parametrize("shares", [{"learner": 1.0}, "learner"])
+def test_whoever_has_begun_an_episode_ends_it(shares, per):
+    behaviour = Behaviour(ROLES, shares, per)
     acting = ["guider", "other", "guider", "other"]
     assert behaviour.choose(acting, np.array([True, False, False, True]), 1.0) == ["learner", "other", "guider", "learner"]
     assert behaviour.choose(acting, ~STARTS, 1.0) == acting

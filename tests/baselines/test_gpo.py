@@ -479,3 +479,19 @@ def test_a_last_rollout_beyond_the_end_is_trained_with_the_schedules_ends():
     assert model.num_timesteps == 128
     assert model.policy.guider.optimizer.param_groups[0]["lr"] == 0.0
     assert model.clip_range_tensor == 0.0
+
+
+@pytest.mark.parametrize("cls", BOTH)
+def test_ratios_begin_at_one_in_mixed_precision_too(cls):
+    """As far as rounding in a batch of another size goes."""
+    model = make_model(cls=cls, mixed_precision=True, n_steps=64, batch_size=64, n_epochs=1, learning_rate=1e-2)
+    ratios, objective = [], model.guider_objective
+
+    def seen(batch, guider, *others):
+        ratios.append((guider.log_prob(batch.actions) - batch.old_log_prob).detach().exp())
+        return objective(batch, guider, *others)
+
+    model.guider_objective = seen
+    model.learn(640)
+    assert len(ratios) == 10
+    assert th.stack(ratios).sub(1).abs().mean() < 1e-4

@@ -569,6 +569,43 @@ def test_networks_rest_and_have_rates_by_role():
     assert all(th.equal(value, before[name]) for name, value in _numbers(model.policy.adaptation).items())
 
 
+def _encoder_and_others(model):
+    encoder = model.policy.critic.features_extractor.extractors[-1]
+    return {
+        "encoder": encoder.output.weight,
+        "critic": model.policy.critic.output.weight,
+        "actor": model.policy.actor.head.mean.weight,
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({}, {"encoder": [0, 1, 2, 3], "critic": [0, 1, 2, 3], "actor": [0, 1, 2, 3]}),
+        ({"policy_delay": 3}, {"encoder": [0, 1, 2, 3], "critic": [0, 1, 2, 3], "actor": [0, 3]}),
+        ({"update_every": {"critic": 2}, "policy_delay": 3}, {"encoder": [0, 2, 3], "critic": [0, 2], "actor": [0, 3]}),
+        ({"update_every": {"expert": 2}}, {"encoder": [0, 2], "critic": [0, 1, 2, 3], "actor": [0, 1, 2, 3]}),
+    ],
+)
+def test_the_encoder_learns_with_the_critics_and_with_the_actor(arguments, expected):
+    model = make(TwoViewBandit(length=7), phase_1_steps=10_000, learning_starts=1000, **arguments)
+    model.learn(40)
+    moved = {name: [] for name in expected}
+    for step in range(4):
+        before = {name: value.detach().clone() for name, value in _encoder_and_others(model).items()}
+        model.train(1, 8)
+        for name, value in _encoder_and_others(model).items():
+            moved[name] += [] if th.equal(value, before[name]) else [step]
+    assert moved == expected
+
+
+def test_an_episode_under_way_when_phase_2_begins_is_no_policys():
+    model, told = make(TwoViewBandit(length=7), phase_1_steps=17, learning_starts=5), []
+    model.on_episode_end = lambda env, episode_return, role: told.append(role)
+    model.learn(28)
+    assert told == [None, "expert", None, "actor"], "the first has steps of the warm-up"
+
+
 # --- it learns ------------------------------------------------------------------------------------------------------------
 
 

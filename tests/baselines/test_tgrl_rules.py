@@ -1,5 +1,7 @@
 """TGRL's own rules: how the teacher's weight moves, who collects, who sees what, and which teachers there are."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
@@ -116,11 +118,45 @@ def test_an_actor_stays_to_its_episodes_end(model):
     assert model.choose_acting(np.array([False, False, True, True])) == ["actor", "auxiliary", "auxiliary", "actor"]
 
 
+IDLE = "teacher's weight stays as it is, since .* behaviour gives none to"
+
+
+@pytest.mark.filterwarnings(f"ignore:The {IDLE} actor")
 def test_whoever_is_told_to_collect_does():
     ended = _roles_of_episodes(_model(TwoViewBandit(length=3), learning_starts=0, behaviour="auxiliary"), 12)
     assert ended == [["auxiliary"] * 4]
 
 
+@pytest.mark.parametrize(
+    ("behaviour", "idle"),
+    [
+        ("actor", "auxiliary:"),
+        ({"teacher": "linear 1 -> 0"}, "auxiliary:"),
+        ({"teacher": 1.0}, "actor and auxiliary:"),
+        ({"auxiliary": "linear 0 -> 0.5"}, None),
+        (None, None),
+    ],
+)
+def test_a_weight_that_can_not_move_is_told(behaviour, idle):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = _model(behaviour=behaviour)
+        _model(behaviour="actor", coef_step=0.0)
+    said = [str(one.message) for one in caught if "teacher's weight" in str(one.message)]
+    assert len(said) == bool(idle)
+    assert all(f"behaviour gives none to {idle} give each" in one for one in said)
+    model.behaviour = None  # from here on they take turns
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        model.follow_arguments()
+
+
+def test_steps_in_between_would_be_missing():
+    with pytest.raises(ValueError, match="n_steps must be 1 for TGRL, got 3: its teacher_critic"):
+        _model(n_steps=3)
+
+
+@pytest.mark.filterwarnings(f"ignore:The {IDLE} actor and auxiliary")
 def test_actors_take_turns_after_a_teacher_that_collected():
     model = _model(TwoViewBandit(length=3), learning_starts=0, behaviour={"teacher": 1.0}).learn(4)
     assert model.acting == ["teacher"]

@@ -95,5 +95,8 @@ def test_memories_compute_alike_in_mixed_precision(cell):
     x = th.randn(200, 3, 3)
     with th.autocast("cpu", dtype=th.bfloat16):
         outputs, _ = memory(x)
+        of_encoded, _ = memory(x.bfloat16())  # as a linear layer before it would hand it on
     expected = memory(x)[0]
-    assert (outputs - expected).abs().mean() < 0.02 * expected.abs().mean()
+    for found in (outputs, of_encoded):
+        assert found.dtype == th.float32
+        assert (found - expected).abs().mean() < 0.02 * expected.abs().mean()

@@ -1,5 +1,6 @@
 """Compiled gradient steps do what plain ones do, notice what changes, and refuse what they can't do."""
 
+from copy import deepcopy
 from functools import partial
 
 import numpy as np
@@ -9,7 +10,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from torch._dynamo.backends.debugging import aot_eager
 
-from sb3_gac import COSIL, GAC, RMA, AsymmetricMPO, AsymmetricSAC, GPOClip
+from sb3_gac import COSIL, GAC, RMA, TGRL, AsymmetricMPO, AsymmetricSAC, GPOClip
 from sb3_gac.optim.compile import Program
 from tests.helpers import Recall, Sampled, TwoViewBandit, TwoViewChoice, small_model
 from tests.registry import LINES, algorithms, load, make, needed
@@ -181,6 +182,33 @@ def test_a_setting_that_is_compiled_in_is_noticed(cls, setting, value, before, t
     _train((plain, compiled, unchanged))
     _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
     with pytest.raises(AssertionError):  # or the setting did not matter
+        _assert_equal(plain, unchanged, rtol=1e-4, atol=1e-6)
+
+
+def test_a_copy_of_a_compiled_model_trains_itself(traced):
+    """The original's programs train the original."""
+    plain, original = _filled(AsymmetricSAC), _filled(AsymmetricSAC, compile=True)
+    _train((plain, original))
+    copy = deepcopy(original)
+    before = [p.clone() for p in original.policy.parameters()]
+    _train((plain, copy))
+    _assert_equal(plain, copy, rtol=1e-4, atol=1e-6)
+    assert all(map(th.equal, before, original.policy.parameters()))
+
+
+@pytest.mark.parametrize("cls", [COSIL, TGRL])
+def test_another_teacher_is_another_program(cls, traced, tmp_path):
+    """Of the same shapes, with layers of another kind."""
+    full = {"role_keys": {"actor": ["partial", "privileged"]}}
+    policy_kwargs = {"net_arch": [16, 16], "activation_fn": th.nn.Tanh}
+    small_model(cls=AsymmetricSAC, policy_kwargs=policy_kwargs, **full).save(tmp_path / "other")
+    plain, compiled, unchanged = _filled(cls), _filled(cls, compile=True), _filled(cls)
+    _train((plain, compiled, unchanged))
+    for model in (plain, compiled):
+        model.teacher = tmp_path / "other"
+    _train((plain, compiled, unchanged))
+    _assert_equal(plain, compiled, rtol=1e-4, atol=1e-6)
+    with pytest.raises(AssertionError):  # or the teacher did not matter
         _assert_equal(plain, unchanged, rtol=1e-4, atol=1e-6)
 
 

@@ -74,7 +74,10 @@ def _check(samples, episodes, whole, length=None, burn_in=0):
             assert (index, n) == (0, len(episode))
         else:
             assert first_counted == min(burn_in, index + first_counted)
-            assert counted == min(length, len(episode) - index - first_counted)
+            assert counted <= length
+            assert (
+                counted == length or index + first_counted == 0 or index + n == len(episode)
+            ), "shorter at a start or end alone"
         numbers = [step[0] for step in part] + [part[-1][1]]
         padding = [0.0] * (steps - n)
         assert privileged[:, b, 0].tolist() == numbers + padding
@@ -103,15 +106,31 @@ def test_sequences_are_what_happened(data, n_envs, whole, burn_in, length):
     _check(recorder.buffer.sample(16), kept, whole, length, burn_in)
 
 
-def test_episodes_are_drawn_uniformly_and_sequences_by_steps():
-    for kwargs, shares in (({}, [1 / 2, 1 / 2]), ({"sequence_length": 2}, [1 / 10, 9 / 10])):
-        recorder = Recorder(_buffer(**kwargs))
-        for step in range(10):
-            recorder.step([TERMINATED if step in (0, 9) else NONE])
-        np.random.seed(0)
-        samples = recorder.buffer.sample(4_000)
-        of_first = (samples.observations["privileged"][0, :, 0] == recorder.finished[0][1][0][0]).float().mean()
-        assert of_first == pytest.approx(shares[0], abs=0.03)
+def _of_one_and_nine_steps(**kwargs):
+    """A buffer with an episode of one step and one of nine."""
+    recorder = Recorder(_buffer(**kwargs))
+    for step in range(10):
+        recorder.step([TERMINATED if step in (0, 9) else NONE])
+    np.random.seed(0)
+    return recorder
+
+
+def test_episodes_are_drawn_uniformly():
+    recorder = _of_one_and_nine_steps()
+    samples = recorder.buffer.sample(4_000)
+    of_first = (samples.observations["privileged"][0, :, 0] == recorder.finished[0][1][0][0]).float().mean()
+    assert of_first == pytest.approx(1 / 2, abs=0.03)
+
+
+@pytest.mark.parametrize(("length", "burn_in"), [(1, 0), (2, 0), (4, 3), (9, 2), (30, 0)])
+def test_of_sequences_each_step_counts_equally_often(length, burn_in):
+    """The first steps and the last of an episode too: the only step of one, and every step of a short one."""
+    recorder = _of_one_and_nine_steps(sequence_length=length, burn_in=burn_in)
+    samples = recorder.buffer.sample(20_000)
+    counted = samples.observations["privileged"][:-1, :, 0][samples.mask > 0]
+    shares = [(counted == step[0]).float().mean() for _, episode in recorder.finished for step in episode]
+    assert len(shares) == 10
+    assert shares == pytest.approx([0.1] * 10, rel=0.08)
 
 
 def test_a_long_episode_whose_start_was_overwritten_is_gone_though_shorter_ones_ended_before_it():
