@@ -38,29 +38,32 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 FORMATS = ("png", "pdf", "svg")
+#: Largest number of runs in a cell whose lines a reader can follow
+MOST_RUNS = 50
 
 
 def draw(tidy: pd.DataFrame, paths: Sequence[Path], to_run: Collection[str] | None = None) -> None:
     """
-    Draw the figure: tasks across, noises down; each run's learner in a thin line, the mean of the learners with its interval,
-    and the mean of the guiders in dashes.
+    Draw the figure: tasks across, noises down; each run's learner in a thin line, where there are few enough to follow, the
+    mean of the learners with its interval, and the mean of the guiders in dashes.
 
     :param tidy: aggregated evaluations
     :param paths: files of the figure; a suffix names the file's format
     :param to_run: names of the suite's runs that are not made yet; ``None`` where they are not known
     """
     tasks, noises, algorithms = grid(tidy)
-    size = (4.2 * len(tasks), 3.0 * len(noises))
+    size = (max(4.2 * len(tasks), 6.0), 3.0 * len(noises))
     figure, axes = plt.subplots(len(noises), len(tasks), figsize=size, layout="constrained", squeeze=False)
     for row, noise in enumerate(noises):
         for column, task in enumerate(tasks):
             axis = axes[row][column]
             cell = tidy[(tidy.task == task) & (tidy.noise == noise)]
+            draws_runs = cell.groupby(["algorithm", "seed"]).ngroups <= MOST_RUNS
             for algorithm, color in palette(algorithms).items():
                 group = cell[cell.algorithm == algorithm]
                 if group.empty:
                     continue
-                for _, run in group.groupby("seed"):
+                for _, run in group.groupby("seed") if draws_runs else ():
                     axis.plot(run.timesteps, run.learner, color=color, linewidth=0.6, alpha=0.5)
                 learner = curves(group)
                 axis.plot(learner.index, learner["mean"], color=color, label=algorithm, linewidth=1.8)

@@ -85,6 +85,20 @@ def test_a_figure_of_one_cell_names_all_of_its_algorithms(tmp_path, monkeypatch)
     assert [text.get_text() for text in kept.get_texts()] == names
 
 
+@pytest.mark.parametrize(("seeds", "lines"), [(25, 2 * 25 + 2), (26, 2)])
+def test_runs_are_drawn_where_they_can_be_followed(seeds, lines, tmp_path, monkeypatch):
+    drawn, make = [], Figure.savefig
+    monkeypatch.setattr(
+        Figure,
+        "savefig",
+        lambda figure, *args, **kwargs: (make(figure, *args, **kwargs), drawn.append(len(figure.axes[0].get_lines()))),
+    )
+    one = _tidy(["sac", "sac-asym"])
+    one = one[(one.task == "Ant") & (one.noise == one.noise.min()) & (one.seed == 0)]
+    draw(pd.concat([one.assign(seed=seed) for seed in range(seeds)]), [tmp_path / "figure.png"])
+    assert drawn == [lines]
+
+
 def test_a_legend_of_many_rows_makes_the_figure_higher(tmp_path, monkeypatch):
     heights, make = [], Figure.savefig
     monkeypatch.setattr(
