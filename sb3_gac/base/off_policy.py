@@ -70,7 +70,8 @@ class AsymmetricOffPolicyAlgorithm(OffPolicyActing, AsymmetricAlgorithm, DataCol
     :param replay_buffer_kwargs: keyword arguments of the replay buffer's class
     :param optimize_memory_usage: argument of replay buffers of other classes, see SB3
     :param n_steps: number of rewards that a critic's target sums up before it bootstraps; more than 1 needs a
-        :class:`CompactDictReplayBuffer`, or a class of one's own that takes ``n_steps`` in ``replay_buffer_kwargs``
+        :class:`CompactDictReplayBuffer`, or a class of one's own that takes ``n_steps`` in ``replay_buffer_kwargs``. Terms of
+        the policies, entropy and KL, are in the target where it bootstraps, and not in the steps in between
     :param ent_coef: entropy temperature: "auto" or "auto_<start value>" for a learned one, or a number
     :param target_update_interval: number of gradient steps between two updates of the target networks
     :param target_entropy: entropy that a learned temperature aims at, in nats: "auto", "sac" or a number, see
