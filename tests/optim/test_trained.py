@@ -242,3 +242,15 @@ def test_steps_by_hand_in_between_count_once_for_each_parameter():
         th.testing.assert_close(one, other)
         assert trained.optimizer.state[one]["step"] == 6
     assert [entry["step"].shape for entry in trained.optimizer.state_dict()["state"].values()] == [()] * 3
+
+
+def test_of_what_is_left_the_memory_has_its_rate_where_another_parameter_is_frozen():
+    ours = _parameters((3,), (2, 2), (4,))
+    trained = TrainedParameters(ours, th.optim.Adam(ours, lr=0.1, fused=True), memory=[ours[2]])
+    trained.scale_memory(0.25)
+    ours[0].requires_grad_(False)
+    trained.refresh(compiled=False)
+    before = [p.detach().clone() for p in ours]
+    trained.step([th.ones(2, 2), th.ones(4)])  # of which Adam's first step has the length of the learning rate
+    moved = [(p - old).abs().max().item() for p, old in zip(ours, before, strict=True)]
+    assert moved == pytest.approx([0.0, 0.1, 0.025], rel=1e-4)
