@@ -30,9 +30,26 @@ def read_tidy(path: Path | TextIO) -> pd.DataFrame:
     :param path: CSV file of aggregated evaluations, or its text in an open file
     :return: table of evaluations, with ``NO_NOISE`` where the noise is empty
     """
-    # A task may be named 2048, and an algorithm NA: names are no numbers, and none of them is missing
-    as_written = {"task": str, "algorithm": str}
-    return pd.read_csv(path, dtype={"noise": float}, converters=as_written).fillna({"noise": NO_NOISE})
+    # A task may be named 2048, and an algorithm NA: names are no numbers, and none of them is missing. Python reads the number
+    # that was written, to the last digit; pandas need not
+    as_written = {"task": str, "algorithm": str, "noise": lambda text: float(text) if text else NO_NOISE}
+    return pd.read_csv(path, converters=as_written)
+
+
+def as_csv(tidy: pd.DataFrame) -> str:
+    """
+    :param tidy: evaluations, see :func:`read_tidy`
+    :return: text of a CSV file, in which measured numbers have six significant digits, and the noise, which identifies a run,
+        as many as it takes
+    """
+    return tidy.assign(noise=tidy.noise.map(_in_full)).to_csv(index=False, float_format="%.6g")
+
+
+def _in_full(noise: float) -> str | None:
+    if noise == NO_NOISE:
+        return None
+    short = f"{noise:.6g}"
+    return short if float(short) == noise else repr(noise)
 
 
 def together(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:

@@ -152,6 +152,19 @@ def test_a_finished_run_with_former_names_of_arguments_counts(tmp_path):
         is_finished(spec, tmp_path)
 
 
+@pytest.mark.filterwarnings("ignore:.*has no arguments at noise")
+@pytest.mark.parametrize("noise", [0.33333333, 0.1 + 0.2, 1e-7])
+def test_a_noise_of_many_digits_is_found_in_results(noise, tmp_path):
+    suite = _suite(tmp_path, CELL | {"noises": [noise]})
+    for spec in read_suite(suite):
+        _finish(spec, tmp_path)
+    first = _aggregate(suite, tmp_path, tmp_path / "first")
+    again = _aggregate(suite, tmp_path / "none", tmp_path / "again", "--reuse-results", tmp_path / "first")
+    assert first["cells"] == again["cells"]
+    assert {cell["noise"] for cell in again["cells"]} == {noise}
+    assert (tmp_path / "first.csv").read_bytes() == (tmp_path / "again.csv").read_bytes()
+
+
 def test_a_run_with_the_same_normalisation_counts(tmp_path):
     suite = _suite(tmp_path, CELL | {"algorithms": ["mine"]}, algorithms=NORMALIZED)
     spec = read_suite(suite)[0]
