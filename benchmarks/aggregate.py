@@ -45,6 +45,7 @@ from benchmarks.tidy import (
     NAMES,
     NEEDED,
     NO_NOISE,
+    as_csv,
     file_of,
     normalised_scores,
     read_tidy,
@@ -329,7 +330,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         made = origins(runs)
     except (ValueError, OSError) as error:
         sys.exit(str(error))
-    text = collect(runs).replace({"noise": {NO_NOISE: np.nan}}).to_csv(index=False, float_format="%.6g")
+    text = as_csv(collect(runs))
     tidy = read_tidy(StringIO(text))  # so that the scores can be computed from the file to the last digit
     equal = with_equal_returns(tidy)
     for sentence in [*equal, *_about_set_aside(found.set_aside)]:

@@ -9,10 +9,11 @@ from typing import Any, TypeAlias
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_gac import ExactCheckpointCallback, SeededEvalCallback
 from sb3_gac.checkpoint.files import checkpoints
+from sb3_gac.deploy.statistics import STATISTICS
 
 CHECKPOINT, TIMING = "checkpoint", "timing.json"
 #: A model, and the state of the callback that evaluates it
@@ -103,8 +104,8 @@ class ExactCheckpoints:
 
 class SB3Checkpoints(ExactCheckpoints):
     """
-    The checkpoints of a run of one of SB3's own algorithms: model, and replay buffer if it has one. A run that goes on from
-    one starts new episodes, with another seed.
+    The checkpoints of a run of one of SB3's own algorithms: model, replay buffer if it has one, and the statistics of
+    ``VecNormalize`` if there is one. A run that goes on from one starts new episodes, with another seed.
     """
 
     def resume(self, algorithm_class: Any, arguments: dict[str, Any], env: VecEnv, seed: int) -> Resumed | None:
@@ -114,6 +115,7 @@ class SB3Checkpoints(ExactCheckpoints):
                 model = algorithm_class.load(path / "model", env=env, device="cpu")
                 if hasattr(model, "load_replay_buffer"):  # on-policy algorithms have none
                     model.load_replay_buffer(path / "replay_buffer.pkl")
+                _restore_statistics(env, path / STATISTICS)
                 model.set_random_seed(hash((seed, model.num_timesteps)) % 2**31)
                 return model, _as_state(json.loads((path / "history.json").read_text()))
         return None
@@ -137,6 +139,8 @@ class SB3Checkpoints(ExactCheckpoints):
         model.save(new / "model")
         if hasattr(model, "save_replay_buffer"):
             model.save_replay_buffer(new / "replay_buffer.pkl")
+        if (normalize := model.get_vec_normalize_env()) is not None:
+            normalize.save(str(new / STATISTICS))
         write_atomically(new / "history.json", json.dumps(evaluations))
         shutil.rmtree(old, ignore_errors=True)
         if current.exists():
@@ -161,6 +165,20 @@ class _AfterEvaluation(BaseCallback):
         if self.n_calls % self._evaluation.eval_freq == 0:
             self._save(self.model, self._evaluation.checkpoint_state())
         return True
+
+
+def _restore_statistics(env: VecEnv, path: Path) -> None:
+    """Give the ``VecNormalize`` around environments, if there is one, the statistics that another one saved."""
+    normalize = unwrap_vec_normalize(env)
+    if normalize is None:
+        return
+    if not path.exists():
+        raise ValueError(
+            f"{path.parent} lacks {path.name}, the statistics of its normalisation, as checkpoints of earlier versions do: "
+            "remove it, and the run begins again."
+        )
+    saved = VecNormalize.load(str(path), normalize.venv)
+    normalize.obs_rms, normalize.ret_rms = saved.obs_rms, saved.ret_rms
 
 
 def _as_state(notes: Any) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch as th
 import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -26,11 +25,12 @@ from benchmarks.run import check_unfinished
 from benchmarks.suite import NAME, RunSpec, cells_of, default_name, read_definitions
 from benchmarks.tidy import file_of, read_tidy
 from benchmarks.yaml_checks import check_is
+from sb3_gac.base.compiling import AUTO
 from sb3_gac.checkpoint.lock import InUseError, locked
 from sb3_gac.command_line import Parser, from_yaml, mapping, one_of, positive
 from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
-from sb3_gac.optim.compile import PAYS_FROM, missing_compiler
+from sb3_gac.optim.compile import PAYS_FROM
 from sb3_gac.presets import PRESETS, read_preset
 from sb3_gac.training.environments import check_split
 from sb3_gac.training.evaluation import untrained_policies
@@ -96,8 +96,8 @@ def suite_of_options(options: argparse.Namespace) -> dict[str, Any]:
     overrides = dict(options.overrides)
     if "env" in cell and not options.whole_state:
         overrides = {"role_keys": None, **overrides}
-    if "compile" not in overrides and options.steps >= PAYS_FROM and missing_compiler(th.device("cpu")) is None:
-        overrides["compile"] = True
+    if "compile" not in overrides and options.steps >= PAYS_FROM:
+        overrides["compile"] = AUTO  # overrides tell runs apart, so they must not depend on this machine's compiler
     return {
         "steps": options.steps,
         "envs": preset.envs,

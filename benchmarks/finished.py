@@ -12,7 +12,14 @@ from typing import Any, NamedTuple, TypeAlias
 import pandas as pd
 import yaml
 
-from benchmarks.config import in_present_names, normalization, read_algorithm, resolve, settings_in_present_names
+from benchmarks.config import (
+    in_present_names,
+    normalization,
+    read_algorithm,
+    resolve,
+    settings_in_present_names,
+    with_defaults,
+)
 from benchmarks.suite import UNSAID, RunSpec, made_with
 from benchmarks.tidy import NAMES, NEEDED, NO_NOISE, file_of, read_tidy
 
@@ -117,13 +124,15 @@ def _changed(spec: RunSpec, configuration: Mapping[str, Any]) -> list[str]:
     kind, arguments = resolve(spec)
     recorded, wanted = (settings_in_present_names(kind, one) for one in (UNSAID | configuration["run"], asdict(spec)))
     changed = sorted(name for name, value in wanted.items() if recorded.get(name) != value)
-    changed += conflicts("arguments", in_present_names(kind, configuration.get("arguments") or {}), arguments)
+    if (made_of := configuration.get("arguments")) is not None:
+        changed += conflicts("arguments", with_defaults(kind, in_present_names(kind, made_of), arguments), arguments)
     return changed + ["normalize"] * (_normalize_in(configuration) != normalize_of(spec))
 
 
 def conflicts(name: str, recorded: Any, other: Any) -> list[str]:
     """
-    Compare recorded arguments with others. One that was not recorded has no other value: earlier versions may have lacked it.
+    Compare recorded arguments with others. One that was not recorded has no other value: see
+    :func:`~benchmarks.config.with_defaults` for the value that it had.
 
     :param name: name of the arguments, with which the names that are returned begin
     :param recorded: arguments as they were recorded, or one of them

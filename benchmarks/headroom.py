@@ -19,7 +19,7 @@ import pandas as pd
 from scipy import stats
 
 from benchmarks.intervals import CONFIDENCE, Difference, difference, mean_interval
-from benchmarks.tidy import NO_NOISE, after_needed, file_of, number, read_tidy, steps_before
+from benchmarks.tidy import NO_NOISE, after_needed, file_of, names_apart, number, read_tidy, steps_before, together
 from sb3_gac.envs.table import in_columns
 
 FULL, ASYMMETRIC, GUIDED, PARTIAL = "sac-full", "sac-asym", "gac", "sac"
@@ -222,14 +222,16 @@ def read_together(paths: Sequence[Path]) -> pd.DataFrame:
     Read several results, such as those of as many steps and of five times as many.
 
     :param paths: paths of aggregated results, without a suffix
-    :return: aggregated evaluations of all; an algorithm that earlier results have too bears the name of its own results
+    :return: aggregated evaluations of all; an algorithm that earlier results have too bears the name of its own results, after
+        as many of their folders as tell them apart
+    :raises ValueError: if two paths are the same
     """
     tables: list[pd.DataFrame] = []
-    for path in paths:
+    for path, of_results in zip(paths, names_apart(paths), strict=True):
         tidy = read_tidy(file_of(path, "csv"))
         known = {name for table in tables for name in table.algorithm}
-        tables.append(tidy.assign(algorithm=[f"{name} ({path.name})" if name in known else name for name in tidy.algorithm]))
-    return pd.concat(tables)
+        tables.append(tidy.assign(algorithm=[f"{name} ({of_results})" if name in known else name for name in tidy.algorithm]))
+    return together(tables)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
+from benchmarks.config import read_algorithm, with_defaults
 from benchmarks.finished import FinishedRun, conflicts, kind_of
 from benchmarks.tidy import CELL, NO_NOISE
 
@@ -43,9 +44,7 @@ def check_same_settings(runs: Sequence[FinishedRun]) -> None:
         by_kind.setdefault(kind_of(run.spec), []).append(run)
     for of_kind in by_kind.values():
         for one, other in combinations(of_kind, 2):
-            back = conflicts("arguments", other.arguments, one.arguments)
-            there = conflicts("arguments", one.arguments, other.arguments)
-            differing = [name for name in there if name in back]  # what one of the two did not record is in one list alone
+            differing = _differing_arguments(one, other)
             if None not in (one.normalize, other.normalize) and one.normalize != other.normalize:
                 differing.append("normalize")
             if differing:
@@ -53,6 +52,14 @@ def check_same_settings(runs: Sequence[FinishedRun]) -> None:
                     f"{one.name} and {other.name} were made with different values of {differing}: make one of them again, "
                     "with the suite's settings, or leave it out of the suite."
                 )
+
+
+def _differing_arguments(one: FinishedRun, other: FinishedRun) -> list[str]:
+    kind, _ = read_algorithm(one.spec.algorithm, one.spec.definition)
+    mine, others = with_defaults(kind, one.arguments, other.arguments), with_defaults(kind, other.arguments, one.arguments)
+    back = conflicts("arguments", others, mine)
+    # What one of the two did not record, and what has no default, is in one list alone
+    return [name for name in conflicts("arguments", mine, others) if name in back]
 
 
 def with_equal_returns(tidy: pd.DataFrame) -> list[str]:

@@ -1,6 +1,7 @@
 """The table of evaluations that ``aggregate`` writes and other programs read, the scores of its runs, and their digits."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -29,9 +30,58 @@ def read_tidy(path: Path | TextIO) -> pd.DataFrame:
     :param path: CSV file of aggregated evaluations, or its text in an open file
     :return: table of evaluations, with ``NO_NOISE`` where the noise is empty
     """
-    # A task may be named 2048, and an algorithm NA: names are no numbers, and none of them is missing
-    as_written = {"task": str, "algorithm": str}
-    return pd.read_csv(path, dtype={"noise": float}, converters=as_written).fillna({"noise": NO_NOISE})
+    # A task may be named 2048, and an algorithm NA: names are no numbers, and none of them is missing. Python reads the number
+    # that was written, to the last digit; pandas need not
+    as_written = {"task": str, "algorithm": str, "noise": lambda text: float(text) if text else NO_NOISE}
+    return pd.read_csv(path, converters=as_written)
+
+
+def as_csv(tidy: pd.DataFrame) -> str:
+    """
+    :param tidy: evaluations, see :func:`read_tidy`
+    :return: text of a CSV file, in which measured numbers have six significant digits, and the noise, which identifies a run,
+        as many as it takes
+    """
+    return tidy.assign(noise=tidy.noise.map(_in_full)).to_csv(index=False, float_format="%.6g")
+
+
+def _in_full(noise: float) -> str | None:
+    if noise == NO_NOISE:
+        return None
+    short = f"{noise:.6g}"
+    return short if float(short) == noise else repr(noise)
+
+
+def together(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """
+    :param tables: evaluations of several results, see :func:`read_tidy`
+    :return: one table of them all; if any of them has ``needed_steps``, this column is 0 for the runs of those without it
+    :raises ValueError: if two of them have the same run, so that its evaluations would count twice
+    """
+    runs = pd.concat([table[NAMES].drop_duplicates() for table in tables])
+    if runs.duplicated().any():
+        run = runs[runs.duplicated()].iloc[0]
+        noise = "" if run.noise == NO_NOISE else f", noise {run.noise:g}"
+        raise ValueError(f"Several results have the run {run.algorithm}, {run.task}{noise}, seed {run.seed}: leave one out.")
+    tidy = pd.concat(tables, ignore_index=True)
+    return tidy.assign(**{NEEDED: tidy[NEEDED].fillna(0).astype(int)}) if NEEDED in tidy else tidy
+
+
+def names_apart(paths: Sequence[Path]) -> list[str]:
+    """
+    :param paths: paths of results
+    :return: for each path its name, after as many of its folders as no other path ends with
+    :raises ValueError: if two paths are the same
+    """
+    parts = [path.resolve().parts for path in paths]
+    return [_shortest_end(one, [*parts[:index], *parts[index + 1 :]]) for index, one in enumerate(parts)]
+
+
+def _shortest_end(parts: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> str:
+    for length in range(1, len(parts) + 1):
+        if all(other[-length:] != parts[-length:] for other in others):
+            return str(Path(*parts[-length:]))
+    raise ValueError(f"{Path(*parts)} is among the results more than once: leave one out.")
 
 
 def with_needed_steps(tidy: pd.DataFrame) -> pd.DataFrame:

@@ -13,7 +13,7 @@ import yaml
 from benchmarks.finished import name_of
 from benchmarks.page.cells import palette, title_of
 from benchmarks.suite import HERE, read_suite
-from benchmarks.tidy import NEEDED, read_tidy, with_needed_steps
+from benchmarks.tidy import NEEDED, read_tidy, together, with_needed_steps
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -94,10 +94,11 @@ def results_of(suites: Sequence[str]) -> pd.DataFrame:
     """
     :param suites: names of suites
     :return: aggregated evaluations of the suites that have results; steps of needed runs are part of ``timesteps``
+    :raises ValueError: if two of the suites have the same run
     """
     paths = [RESULTS / f"{name}.csv" for name in suites]
     frames = [with_needed_steps(read_tidy(path)) for path in paths if path.exists()]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=["task", "noise", "algorithm"])
+    return together(frames) if frames else pd.DataFrame(columns=["task", "noise", "algorithm"])
 
 
 def needs(name: str) -> str:

@@ -15,7 +15,11 @@ from benchmarks.bootstrap import interval
 from benchmarks.finished import FinishedRun
 from benchmarks.run_checks import check_finite, with_equal_returns
 from benchmarks.suite import RunSpec
-from benchmarks.tidy import read_tidy
+from benchmarks.tidy import NO_NOISE, as_csv, read_tidy
+
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
+#: Written by an earlier version, with more digits
+WITH_MORE_DIGITS = {"halfcheetah", "independent", "precision"}
 
 
 @pytest.fixture(autouse=True)
@@ -57,6 +61,20 @@ def test_an_algorithm_reaches_its_own_end():
     tidy = pd.concat([_evaluations("sac-asym", seed, [0, end]) for seed, end in ends.items()])
     (cell,) = summarise_cells(tidy, reference="sac-asym")
     assert cell["steps_to_reference"] == 10_000
+
+
+@pytest.mark.parametrize("name", sorted({path.stem for path in RESULTS.glob("*.csv")} - WITH_MORE_DIGITS))
+def test_committed_results_are_written_as_they_are(name):
+    path = RESULTS / f"{name}.csv"
+    assert as_csv(read_tidy(path)) == path.read_text()
+
+
+def test_returns_have_six_digits_and_a_noise_as_many_as_it_takes():
+    noises = {0.1: "0.1", 0.0: "0", 1.0: "1", 0.33333333: "0.33333333", 1e-7: "1e-07", NO_NOISE: ""}
+    tidy = pd.concat([_evaluations("gac", 0, [1 / 3, 2]).assign(noise=noise) for noise in noises])
+    rows = [line.split(",") for line in as_csv(tidy).splitlines()]
+    assert [row[rows[0].index("noise")] for row in rows[1::2]] == list(noises.values())
+    assert {row[rows[0].index("learner")] for row in rows[1:]} == {"0.333333", "2"}
 
 
 @pytest.mark.parametrize("name", ["NA", "None", "2048", "0.10", "nan"])

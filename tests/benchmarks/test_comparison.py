@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
+import torch as th
 import yaml
 from gymnasium import spaces
 
@@ -21,6 +22,7 @@ from benchmarks.headroom import worth
 from benchmarks.run import run
 from benchmarks.suite import RunSpec, cells_of, read_suite
 from sb3_gac.checkpoint.lock import locked
+from sb3_gac.optim.compile import missing_compiler
 
 SPLIT = "sb3_gac.envs:SplitObservation: {partial: [0, 1], privileged: [2]}"
 SMALL = "{learning_starts: 20, batch_size: 4, gradient_steps: 1, policy_kwargs: {net_arch: [4]}}"
@@ -210,13 +212,17 @@ def test_a_registered_task_has_its_own_settings():
     assert cell["env"] == "sb3_gac/Hopper-v5", "with arguments that the task's settings are not for"
 
 
-def test_gradient_steps_are_compiled_where_it_pays(monkeypatch):
-    monkeypatch.setattr(comparison, "missing_compiler", lambda device: None)
-    assert _suite("--env", "m:make", "--steps", 10_000)["overrides"]["compile"] is True
+def test_gradient_steps_are_compiled_where_it_pays():
+    assert _suite("--env", "m:make", "--steps", 10_000)["overrides"]["compile"] == "auto"
     assert "compile" not in _suite("--env", "m:make", "--steps", 9_000)["overrides"]
     assert _suite("--env", "m:make", "--overrides", "{compile: false}")["overrides"]["compile"] is False
-    monkeypatch.setattr(comparison, "missing_compiler", lambda device: "C++ compiler")
-    assert "compile" not in _suite("--env", "m:make")["overrides"]
+
+
+def test_runs_are_the_same_with_a_compiler_and_without(monkeypatch):
+    with_compiler = _suite("--env", "m:make")
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    assert missing_compiler(th.device("cpu")) == "C++ compiler (no-such-compiler)", "or nothing is tested"
+    assert _suite("--env", "m:make") == with_compiler
 
 
 def test_a_function_that_makes_an_environment(engine, monkeypatch, tmp_path, capsys):

@@ -1,6 +1,9 @@
 """What privileged information is worth: differences and intervals by hand, verdicts, and the sentences that they give."""
 
 import math
+import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,7 +13,9 @@ from scipy import stats
 from benchmarks.advice import findings, in_words, recommendation
 from benchmarks.comparison_page import page
 from benchmarks.headroom import ends_table, headroom_curve, main, number, power, read_together, seeds_to_see, worth
-from benchmarks.tidy import NO_NOISE
+from benchmarks.tidy import NO_NOISE, together
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 RANDOM = {"random actions": np.array([-2.0, 0.0, 2.0, 0.0])}
 
@@ -267,6 +272,57 @@ def test_several_results_are_read_together_and_told_apart(tmp_path):
         ("of-many", "1.50"),
     ]
     assert rows[0][-1].startswith("-10.0, "), "gac over gac (many)"
+
+
+def test_results_of_one_name_are_told_apart_by_their_folders(tmp_path):
+    paths = [tmp_path / folder / "results" for folder in ("a", "b", "c")]
+    for path, end in zip(paths, (10.0, 20.0, 90.0), strict=True):
+        path.parent.mkdir()
+        _tidy({"gac": [end, end + 2]}).assign(noise=0.1).to_csv(path.with_suffix(".csv"), index=False)
+    rows = ends_table(read_together(paths), "sac-asym")
+    assert [(row[2], row[3]) for row in rows] == [
+        ("gac", "10.0, 12.0"),
+        ("gac (b/results)", "20.0, 22.0"),
+        ("gac (c/results)", "90.0, 92.0"),
+    ]
+    with pytest.raises(ValueError, match=r"a/results is among the results more than once: leave one out"):
+        read_together([paths[0], paths[1], paths[0]])
+
+
+def test_a_run_that_several_results_have_does_not_count_twice():
+    few, more = _tidy({"gac": [1.0, 2.0]}).assign(noise=0.1), _tidy({"gac": [3.0]}, steps=(50, 150)).assign(noise=0.1)
+    with pytest.raises(ValueError, match=r"Several results have the run gac, T, noise 0\.1, seed 0: leave one out"):
+        together([few, more])
+    pd.testing.assert_frame_equal(
+        together([few, more.assign(seed=2)]), pd.concat([few, more.assign(seed=2)], ignore_index=True)
+    )
+
+
+def test_needed_steps_that_results_do_not_have_are_0():
+    taught = _tidy({"tgrl": [1.0]}).assign(noise=0.1, needed_steps=20_000)
+    tidy = together([_tidy({"gac": [1.0]}).assign(noise=0.1), taught])
+    assert [row[2] for row in ends_table(tidy, "sac-asym")] == ["gac", "tgrl, after 20,000 steps of needed runs"]
+
+
+DOCUMENTED = sorted(
+    {
+        " ".join(command.split())
+        for page in DOCS.glob("*.md")
+        for command in re.findall(r"benchmarks\.headroom\s+([^`\n]*(?:\n[^`\n]+)?)`", page.read_text())
+    }
+)
+
+
+def test_the_documented_commands_are_found():
+    assert len(DOCUMENTED) > 10
+    assert "benchmarks/results/baselines benchmarks/results/brax-choices" in DOCUMENTED
+
+
+@pytest.mark.parametrize("command", DOCUMENTED)
+def test_documented_commands_print_a_table(command, capsys, monkeypatch):
+    monkeypatch.chdir(DOCS.parent)
+    main(shlex.split(command))
+    assert "each seed's end" in capsys.readouterr().out
 
 
 def test_the_command_prints_the_committed_results(capsys):

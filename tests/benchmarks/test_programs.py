@@ -4,6 +4,7 @@ import importlib
 import itertools
 import json
 import math
+import pickle
 import re
 import shutil
 import signal
@@ -23,6 +24,7 @@ import yaml
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.vec_env import VecNormalize
 
 import benchmarks.config
 import benchmarks.run
@@ -656,6 +658,30 @@ def test_a_run_goes_on_from_its_checkpoint(tmp_path, monkeypatch, algorithm):
         resumed, model = (read_algorithm(algorithm)[0].load(path / "model") for path in (directory, undisturbed))
         assert all(th.equal(p, q) for p, q in zip(resumed.policy.parameters(), model.policy.parameters(), strict=True))
     assert {path.name for path in directory.iterdir()} == {path.name for path in undisturbed.iterdir()}
+
+
+@pytest.mark.parametrize(("kind", "own"), [("SAC", {"learning_starts": 100, "batch_size": 16}), ("PPO", {"n_steps": 50})])
+def test_the_statistics_of_sb3s_runs_go_on_too(tmp_path, monkeypatch, kind, own):
+    small = {"policy_kwargs": {"net_arch": [4]}, **own}
+    definition = {"class": f"stable_baselines3:{kind}", "normalize": {"norm_reward": True}}
+    spec = replace(read_suite(SMOKE)[0], algorithm="mine", preset="sb3", overrides=small, definition=definition)
+    with monkeypatch.context() as context:
+        context.setattr(benchmarks.run, "Stopwatch", _Killed)
+        with pytest.raises(KeyboardInterrupt):
+            run(spec, tmp_path)
+    found, expected = (
+        pickle.loads((run(spec, root) / "vecnormalize.pkl").read_bytes()) for root in (tmp_path, tmp_path / "undisturbed")
+    )
+    assert found.ret_rms.count == expected.ret_rms.count, "one return of each of 600 steps"
+    assert found.obs_rms["partial"].count == expected.obs_rms["partial"].count + spec.envs, "one more reset"
+
+
+def test_a_checkpoint_without_the_statistics_of_its_normalisation_is_refused(tmp_path):
+    env, checkpoints = VecNormalize(sb3_gac.envs.make_vec("sb3_gac/Pendulum-v1", 1)), SB3Checkpoints(tmp_path)
+    checkpoints._save(PPO("MultiInputPolicy", env, n_steps=8).learn(8), {"history": []})
+    (tmp_path / "checkpoint" / "vecnormalize.pkl").unlink()
+    with pytest.raises(ValueError, match=r"lacks vecnormalize.pkl, .*: remove it, and the run begins again"):
+        checkpoints.resume(PPO, {}, env, 0)
 
 
 def test_a_column_that_later_evaluations_lack_stays_in_the_file():

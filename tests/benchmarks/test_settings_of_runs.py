@@ -11,7 +11,7 @@ import yaml
 import benchmarks.aggregate
 import benchmarks.bootstrap
 from benchmarks.aggregate import finished_runs, origins
-from benchmarks.config import resolve
+from benchmarks.config import resolve, with_defaults
 from benchmarks.finished import FinishedRun, conflicts, is_finished, name_of, read_results
 from benchmarks.launch import jobs_left
 from benchmarks.page.document import _origin
@@ -82,12 +82,53 @@ def test_a_finished_run_with_other_arguments_is_neither_skipped_nor_counted(tmp_
         _aggregate(suite, tmp_path, tmp_path / "made")
 
 
-def test_what_a_run_of_an_earlier_version_did_not_record_is_no_other_value(tmp_path):
+def _suite_with(directory, **arguments):
+    return _suite(directory, overrides=SMALL_SUITE["overrides"] | arguments)
+
+
+@pytest.mark.parametrize(
+    ("now", "missing", "named"),
+    [
+        ({"gamma": 0.99}, "gamma", None),
+        ({"gamma": 0.1}, "gamma", "arguments.gamma"),
+        ({"kl_coef_bounds": [0.0001, 100.0]}, "kl_coef_bounds", None),  # whose default is a tuple
+        ({"policy_kwargs": {"net_arch": [4], "n_critics": 2}}, "n_critics", None),
+        ({"policy_kwargs": {"net_arch": [4], "n_critics": 3}}, "n_critics", "arguments.policy_kwargs.n_critics"),
+        ({}, "policy_kwargs", "arguments.policy_kwargs.net_arch"),
+        ({"policy_kwargs": {"optimizer_class": "torch.optim:Adam"}}, "optimizer_class", None),  # which YAML can't say
+    ],
+)
+def test_an_argument_that_was_not_recorded_had_its_default(now, missing, named, tmp_path):
+    spec, *_ = read_suite(_suite_with(tmp_path, **now))
+
+    def without(configuration):
+        arguments = configuration["arguments"]
+        del (arguments if missing in arguments else arguments["policy_kwargs"])[missing]
+
+    _finish(spec, tmp_path, without)
+    if named is None:
+        assert is_finished(spec, tmp_path)
+        return
+    with pytest.raises(ValueError, match=rf"other settings under \['{named}'\]: remove it"):
+        is_finished(spec, tmp_path)
+
+
+class Patient(GAC):
+    """Hands on most arguments, as one's own algorithms do."""
+
+    def __init__(self, *args, patience=3, **kwargs):
+        super().__init__(*args, **kwargs)
+
+
+def test_the_defaults_of_ancestors_count_where_a_constructor_hands_arguments_on():
+    wanted = {"patience": 4, "gamma": 0.1, "tau": 1, "unknown": 2, "policy_kwargs": {"n_critics": 3}}
+    complete = with_defaults(Patient, {"tau": 0.5}, wanted)
+    assert complete == {"patience": 3, "gamma": 0.99, "tau": 0.5, "policy_kwargs": {"n_critics": 2}}
+
+
+def test_what_no_version_recorded_is_no_other_value(tmp_path):
     suite = _suite(tmp_path)
     spec, *_ = read_suite(suite)
-    for missing in ("tau", "policy_kwargs"):
-        _finish(spec, tmp_path, lambda one, missing=missing: one["arguments"].pop(missing))
-        assert is_finished(spec, tmp_path)
     _finish(spec, tmp_path, lambda one: one.pop("arguments"))
     assert is_finished(spec, tmp_path)
     _finish(spec, tmp_path, lambda one: one["run"].pop("eval_episodes"))
@@ -109,6 +150,19 @@ def test_a_finished_run_with_former_names_of_arguments_counts(tmp_path):
     _finish(spec, tmp_path, lambda one: former("learner", one))
     with pytest.raises(ValueError, match=r"\['overrides', 'arguments.shared_std'\]"):
         is_finished(spec, tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore:.*has no arguments at noise")
+@pytest.mark.parametrize("noise", [0.33333333, 0.1 + 0.2, 1e-7])
+def test_a_noise_of_many_digits_is_found_in_results(noise, tmp_path):
+    suite = _suite(tmp_path, CELL | {"noises": [noise]})
+    for spec in read_suite(suite):
+        _finish(spec, tmp_path)
+    first = _aggregate(suite, tmp_path, tmp_path / "first")
+    again = _aggregate(suite, tmp_path / "none", tmp_path / "again", "--reuse-results", tmp_path / "first")
+    assert first["cells"] == again["cells"]
+    assert {cell["noise"] for cell in again["cells"]} == {noise}
+    assert (tmp_path / "first.csv").read_bytes() == (tmp_path / "again.csv").read_bytes()
 
 
 def test_a_run_with_the_same_normalisation_counts(tmp_path):
@@ -149,10 +203,11 @@ def test_seeds_of_one_algorithm_with_other_arguments_are_not_averaged():
         ]
         return origins([*runs, FinishedRun(replace(spec, algorithm="sac"), rows, {"tau": 9}, [], 1.0, 1)])
 
-    recorded = made_of({"tau": 0.1}, {}, {"tau": 0.1, "b": 2}, normalize=(None, False, False))
+    recorded = made_of({"tau": 0.005}, {}, {"tau": 0.005, "b": 2}, normalize=(None, False, False))
     assert recorded["normalize"] == {"gac, Hopper, noise 0.1": False}
     for arguments, normalize, named in (
-        (({"tau": 0.1}, {}, {"tau": 0.2}), (None, None, None), r"seed0 and .*seed2 .*different values of \['arguments.tau'\]"),
+        (({"tau": 0.1}, {"tau": 0.1}, {"tau": 0.2}), (None, None, None), r"seed0 and .*seed2 .*values of \['arguments.tau'\]"),
+        (({"tau": 0.1}, {}, {"tau": 0.1}), (None, None, None), r"seed0 and .*seed1 .*different values of \['arguments.tau'\]"),
         (({}, {}, {}), (None, False, {"clip_obs": 5.0}), r"seed1 and .*seed2 .*different values of \['normalize'\]"),
     ):
         with pytest.raises(ValueError, match=named):
