@@ -17,8 +17,16 @@ from benchmarks import aggregate, launch
 from benchmarks.advice import counted, findings, recommendation
 from benchmarks.checkpoint import write_atomically
 from benchmarks.comparison_page import page
-from benchmarks.config import check_programs, check_runs, check_simulators, first_gradient_step, reads_partial_alone
+from benchmarks.config import (
+    check_programs,
+    check_runs,
+    check_simulators,
+    first_gradient_step,
+    read_algorithm,
+    reads_partial_alone,
+)
 from benchmarks.environments import EVAL_SEED, environment, make_envs
+from benchmarks.external import Program
 from benchmarks.headroom import ASYMMETRIC, FULL, GUIDED, PARTIAL, worth
 from benchmarks.own_code import about_changed_code, code_of
 from benchmarks.run import check_unfinished
@@ -27,6 +35,7 @@ from benchmarks.tidy import file_of, read_tidy
 from benchmarks.yaml_checks import check_is
 from sb3_gac.base.compiling import AUTO
 from sb3_gac.checkpoint.lock import InUseError, locked
+from sb3_gac.checks.arguments import constructor_parameters
 from sb3_gac.command_line import Parser, from_yaml, mapping, one_of, positive
 from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.suites import SUITES, suite_of, task_of
@@ -96,7 +105,7 @@ def suite_of_options(options: argparse.Namespace) -> dict[str, Any]:
     overrides = dict(options.overrides)
     if "env" in cell and not options.whole_state:
         overrides = {"role_keys": None, **overrides}
-    if "compile" not in overrides and options.steps >= PAYS_FROM:
+    if "compile" not in overrides and options.steps >= PAYS_FROM and all(map(_takes_compile, options.algorithms)):
         overrides["compile"] = AUTO  # overrides tell runs apart, so they must not depend on this machine's compiler
     return {
         "steps": options.steps,
@@ -107,6 +116,12 @@ def suite_of_options(options: argparse.Namespace) -> dict[str, Any]:
         "overrides": overrides,
         "cells": [cell | runs],
     }
+
+
+def _takes_compile(algorithm: str) -> bool:
+    """Whether an algorithm's overrides may have ``compile``: SB3's own algorithms refuse it, and programs get no overrides."""
+    kind, _ = read_algorithm(algorithm)
+    return issubclass(kind, Program) or "compile" in constructor_parameters(kind)
 
 
 def _registered(options: argparse.Namespace) -> dict[str, Any] | None:

@@ -172,8 +172,11 @@ def main() -> None:
         results = with_all_digits(json.loads(file_of(options.results, "json").read_text()), tidy)
     except OSError as error:
         sys.exit(str(error))
-    tidy = tidy.drop(columns=NEEDED, errors="ignore") if options.own_steps else with_needed_steps(tidy)
-    draw(tidy, [file_of(options.results, suffix) for suffix in options.formats], results.get("still_to_run"))
+    if options.own_steps:
+        tidy = tidy.drop(columns=NEEDED, errors="ignore")
+    draw(
+        with_needed_steps(tidy), [file_of(options.results, suffix) for suffix in options.formats], results.get("still_to_run")
+    )
     runs = os.path.relpath(options.runs, options.results.parent)
     file_of(options.results, "html").write_text(page(tidy, results, options.results.name, runs))
     print(f"{cells_table(results['cells'])}\n\n{overall_table(results)}")

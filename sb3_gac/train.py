@@ -73,7 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except Exception:
         _say_how_to_go_on()
         raise
-    print(summary(job.directory, options, job.model.policy.deployed_entries))
+    policy = job.model.policy
+    print(summary(job.directory, options, policy.deployed_entries, remembers=policy.deployed.memory is not None))
 
 
 def _say_how_to_go_on() -> None:

@@ -251,6 +251,32 @@ def test_a_preset_that_normalises_observations_leaves_their_statistics(tmp_path,
     assert results["learner"] == pytest.approx(job.evaluate(DeployedView(model), statistics, 2)[0], rel=1e-3)
 
 
+@pytest.mark.parametrize(("algorithm", "memory"), [("gac", "rnn_type: gru, rnn_hidden_size: 8"), ("rma", "latent_dim: 2")])
+def test_the_printed_lines_carry_the_state_of_a_memory(algorithm, memory, tmp_path, capsys):
+    """The line that acts, repeated over an episode, acts as the model does with its state, and anew in the next episode."""
+    small = f"{{learning_starts: 50, batch_size: 2, gradient_steps: 1, policy_kwargs: {{net_arch: [8], {memory}}}}}"
+    main([*QUICK, "--algorithm", algorithm, "--overrides", small, "--history", "1", "--runs", str(tmp_path)])
+    *before, act, after = textwrap.dedent(capsys.readouterr().out.partition("To use the learner:\n")[2]).strip().splitlines()
+    pasted, state = {}, None
+    exec("\n".join(before), pasted)
+    model = pasted["model"]
+    generator, shape = np.random.default_rng(0), model.observation_space["partial"].shape
+    observations = generator.normal(size=(4, *shape)).astype(np.float32)
+    actions = []
+    for step in (0, 1, 2, 3, 0):
+        pasted["observation"] = observations[step]
+        if step == 0:
+            pasted["start"], state = [True], None
+        exec(act, pasted)
+        exec(after, pasted)
+        expected, state = model.predict({"partial": observations[step]}, state, deterministic=True)
+        np.testing.assert_array_equal(pasted["action"], expected)
+        actions.append(pasted["action"])
+    np.testing.assert_array_equal(actions[4], actions[0])
+    forgetful, _ = model.predict({"partial": observations[3]}, deterministic=True)
+    assert not np.array_equal(actions[3], forgetful), "the memory counts"
+
+
 def test_a_teachers_statistics_are_its_students(tmp_path):
     """So the teacher sees what it was trained on, whether the student's normalisation was asked for or not."""
     small = ["--history", "1", "--overrides", "{learning_starts: 50, batch_size: 8, policy_kwargs: {net_arch: [8]}}"]

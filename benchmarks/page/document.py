@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 
 def page(tidy: pd.DataFrame, results: dict[str, Any], title: str, runs: str) -> str:
     """
-    :param tidy: aggregated evaluations
+    :param tidy: aggregated evaluations, with each run's own environment steps
     :param results: aggregated results
     :param title: title of the page
     :param runs: directory of all runs, relative to the page, to which the page's links to logs point

@@ -11,7 +11,7 @@ from plotly import graph_objects
 from benchmarks.bootstrap import profile
 from benchmarks.intervals import mean_interval
 from benchmarks.page.cells import Lines, folder_of, frame, guider_of, in_cells, palette
-from benchmarks.tidy import NEEDED
+from benchmarks.tidy import NEEDED, with_needed_steps
 
 STEPS, RETURN = "environment steps", "return"
 WITH_NEEDED = "environment steps, with those of needed runs"
@@ -138,15 +138,15 @@ def plots(
     to_run: Collection[str] | None = None,
 ) -> list[Plot]:
     """
-    :param tidy: aggregated evaluations
+    :param tidy: aggregated evaluations, with each run's own environment steps; over steps, a run is drawn after those that it
+        needs, where the column ``needed_steps`` is there
     :param seconds: run's name -> seconds that the run took; if it is empty, there is no plot over seconds
     :param normalised: table with one row for each run: "algorithm", and the "normalised" final return
     :param to_run: names of runs that are not made yet, see :func:`is_wanted`
     :return: plots for which there are data, one for each tab
     """
-    steps = steps_label(tidy)
+    timed, tidy, steps = over_seconds(tidy, seconds), with_needed_steps(tidy), steps_label(tidy)
     drawn = [_plot("Returns", tidy, algorithm_lines, RETURN, steps, _RETURNS, to_run)]
-    timed = over_seconds(tidy, seconds)
     if not timed.empty:
         drawn.append(_plot("Returns over seconds", timed, algorithm_lines, RETURN, "seconds of one core", _SECONDS, to_run))
     if has_guider(tidy):
@@ -182,8 +182,8 @@ _PROFILE = (
 
 def over_seconds(tidy: pd.DataFrame, seconds: Mapping[str, float]) -> pd.DataFrame:
     """
-    :param tidy: aggregated evaluations
-    :param seconds: run's name -> seconds that the run took
+    :param tidy: aggregated evaluations, with each run's own environment steps
+    :param seconds: run's name -> seconds that the run took, without those of the runs that it needs
     :return: evaluations of the runs whose seconds are known; in place of environment steps, ``timesteps`` has the seconds up
         to that step, as a mean over the algorithm's runs in the cell
     """

@@ -15,6 +15,7 @@ with the last of them.
 import hashlib
 import json
 import os
+import re
 import shutil
 import warnings
 from collections.abc import Iterable, Mapping
@@ -23,6 +24,7 @@ from typing import Any
 
 FORMAT = 1
 _PREFIX, _TEMPORARY, _BLOCKS, _MANIFEST = "checkpoint-", ".writing", "blocks", "manifest.json"
+_NAME = re.compile(rf"{_PREFIX}\d{{6,}}-step-\d{{12,}}")
 
 
 class CheckpointError(ValueError):
@@ -120,7 +122,7 @@ def write_checkpoint(root: Path, step: int, files: Mapping[str, bytes], blocks: 
     """
     root.mkdir(parents=True, exist_ok=True)
     earlier = checkpoints(root)
-    number = int(earlier[0].name.split("-")[1]) + 1 if earlier else 1
+    number = _numbers(earlier[0])[0] + 1 if earlier else 1
     final, temporary = root / f"{_PREFIX}{number:06d}-step-{step:012d}", root / _TEMPORARY
     try:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -144,12 +146,12 @@ def write_checkpoint(root: Path, step: int, files: Mapping[str, bytes], blocks: 
 
 def checkpoints(root: Path) -> list[Path]:
     """
-    The checkpoints of a run, whole or not.
+    The checkpoints of a run, whole or not.  Folders with other names, such as a user's copies, are left alone.
 
     :param root: folder of all checkpoints of the run
     :return: folders of the checkpoints, the one written last first
     """
-    return sorted(root.glob(f"{_PREFIX}*"), reverse=True)
+    return sorted((path for path in root.glob(f"{_PREFIX}*") if _NAME.fullmatch(path.name)), key=_numbers, reverse=True)
 
 
 def step_of(checkpoint: Path) -> int:
@@ -159,7 +161,13 @@ def step_of(checkpoint: Path) -> int:
     :param checkpoint: folder of the checkpoint, one of :func:`checkpoints`
     :return: number of environment steps
     """
-    return int(checkpoint.name.rpartition("-")[2])
+    return _numbers(checkpoint)[1]
+
+
+def _numbers(checkpoint: Path) -> tuple[int, int]:
+    """The number and the step of a checkpoint, one of :func:`checkpoints`."""
+    _, number, _, step = checkpoint.name.split("-")
+    return int(number), int(step)
 
 
 def _prune(root: Path, keep: int) -> None:

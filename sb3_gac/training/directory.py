@@ -172,13 +172,14 @@ def how_to_go_on(directory: Path, steps: int) -> str:
     return f"Stopped; {done} are saved. To go on: {command('--resume', str(directory))}"
 
 
-def summary(directory: Path, options: Namespace, entries: Sequence[str] = (PARTIAL,)) -> str:
+def summary(directory: Path, options: Namespace, entries: Sequence[str] = (PARTIAL,), remembers: bool = False) -> str:
     """
     The message at the end of a run.
 
     :param directory: directory of the finished run
     :param options: options of the run, see :func:`resolve`
     :param entries: entries that the learner reads
+    :param remembers: whether the learner has a memory, whose state goes from one action to the next
     :return: text with the results, and how to use the learner
     """
     results = json.loads((directory / RESULTS).read_text())
@@ -190,10 +191,10 @@ Trained {name} on {in_words(options)} for {results["steps"]:,} steps in {results
 Learner, seeing {" and ".join(f"`{key}`" for key in entries)} alone: return {learner} over {options.episodes} episodes.
 Without training, same seeds: {untrained}.
 Saved in {directory}: model.zip, learning_curve.png, results.json, config.yaml. To use the learner:
-{_how_to_use(directory, name, entries)}"""
+{_how_to_use(directory, name, entries, remembers)}"""
 
 
-def _how_to_use(directory: Path, name: str, entries: Sequence[str]) -> str:
+def _how_to_use(directory: Path, name: str, entries: Sequence[str], remembers: bool) -> str:
     """Lines of Python that act with the learner, on observations as the environment returns them."""
     shown_to_it = ", ".join(f'"{key}": {"observation" if len(entries) == 1 else f"observation[{key!r}]"}' for key in entries)
     lines = [f'from sb3_gac import {name}; model = {name}.load("{directory / MODEL}")']
@@ -205,7 +206,15 @@ def _how_to_use(directory: Path, name: str, entries: Sequence[str]) -> str:
             f"normalize = DeploymentNormalizer.from_vec_normalize(statistics, {list(entries)})",
         ]
         observation = f"normalize({observation})"
-    return "\n".join(f"    {line}" for line in [*lines, f"action, _ = model.predict({observation}, deterministic=True)"])
+    if remembers:
+        lines += [
+            "state, start = None, [True]  # once; later the state is that of the last action",
+            f"action, state = model.predict({observation}, state, start, deterministic=True)",
+            "start = [False]  # [True] before the first action of the next episode",
+        ]
+    else:
+        lines.append(f"action, _ = model.predict({observation}, deterministic=True)")
+    return "\n".join(f"    {line}" for line in lines)
 
 
 def in_words(options: Namespace) -> str:

@@ -216,6 +216,8 @@ def test_gradient_steps_are_compiled_where_it_pays():
     assert _suite("--env", "m:make", "--steps", 10_000)["overrides"]["compile"] == "auto"
     assert "compile" not in _suite("--env", "m:make", "--steps", 9_000)["overrides"]
     assert _suite("--env", "m:make", "--overrides", "{compile: false}")["overrides"]["compile"] is False
+    assert "compile" not in _suite("--env", "m:make", "--algorithms", "sac-asym", "sb3-sac")["overrides"], "SB3 has no such"
+    assert _suite("--env", "m:make", "--algorithms", "gpo-clip", "random-actions")["overrides"]["compile"] == "auto"
 
 
 def test_runs_are_the_same_with_a_compiler_and_without(monkeypatch):

@@ -148,6 +148,15 @@ def test_seconds_are_spread_over_a_runs_steps_and_untimed_runs_left_out():
     assert over_seconds(tidy, {}).empty
 
 
+def test_seconds_are_of_a_runs_own_steps_and_the_needed_steps_of_its_axis_alone():
+    """Half of its own steps take half of its seconds, though the axis of steps has 3,000 more in front."""
+    tidy = _tidy(["cosil"]).assign(needed_steps=3000)
+    seconds = {f"small-2000/{task}-noise0.1/cosil/seed{seed}": 20.0 for task in ("Ant", "Hopper") for seed in (0, 1)}
+    drawn = {plot.name: plot.wide for plot in plots(tidy, seconds, normalised_returns(_results()))}
+    shown = {name: {x for line in drawn[name].data for x in line.x} for name in ("Returns", "Returns over seconds")}
+    assert shown == {"Returns": {4000, 5000}, "Returns over seconds": {10.0, 20.0}}
+
+
 def test_tabs_without_data_are_not_there():
     tidy = _tidy(["gac"])
     nothing = normalised_returns({"cells": [], "compared": {"cells": [], "algorithms": []}})

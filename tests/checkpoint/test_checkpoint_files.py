@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -47,6 +48,29 @@ def test_what_was_written_last_stays_though_a_damaged_one_has_more_steps(tmp_pat
     after = _write(tmp_path, 50, text=b"after", keep=1)
     assert checkpoints(tmp_path) == [after]
     assert latest_whole(tmp_path)[1]["state"] == b"after"
+
+
+def test_folders_of_other_names_are_no_checkpoints(tmp_path):
+    """Copies that a user keeps beside the checkpoints end no training, do not count among those to keep, and stay."""
+    first = _write(tmp_path, 10)
+    copies = [tmp_path / name for name in ("checkpoint-best", f"{first.name}-keep", f"checkpoint-x-{first.name}")]
+    for copy in copies:
+        shutil.copytree(first, copy)
+    kept = [_write(tmp_path, step) for step in (20, 30)]
+    assert checkpoints(tmp_path) == kept[::-1]
+    assert latest_whole(tmp_path)[0] == kept[-1]
+    assert all(copy.is_dir() for copy in copies)
+    assert not first.exists()
+
+
+def test_checkpoints_are_in_the_order_of_their_numbers_however_large(tmp_path):
+    (tmp_path / "checkpoint-999999-step-000000000010").mkdir(parents=True)
+    for step in (20, 10**12):
+        _write(tmp_path, step)
+    assert [path.name for path in checkpoints(tmp_path)] == [
+        "checkpoint-1000001-step-1000000000000",
+        "checkpoint-1000000-step-000000000020",
+    ]
 
 
 def test_a_block_is_written_once(tmp_path):
