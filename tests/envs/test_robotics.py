@@ -3,6 +3,7 @@
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from functools import cache
 
 import gymnasium as gym
@@ -326,6 +327,14 @@ def test_a_copy_can_be_made_in_a_process_that_has_made_none(tmp_path):
 def test_refuses_with_the_culprit_named(task, kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_robotics(task, **kwargs)
+
+
+@pytest.mark.parametrize(("task", "other"), [("FetchReach", "FetchPush"), ("AdroitHandDoor", "AdroitHandRelocate")])
+def test_an_observation_of_another_size_is_refused(task, other, monkeypatch):
+    """A later version of the library may change an observation; the split by position would then show other components."""
+    monkeypatch.setitem(TASKS, task, replace(TASKS[task], env_id=TASKS[other].env_id))
+    with pytest.raises(ValueError, match=rf"{other}-v\d has \d+ components, but it is split by position as one of \d+"):
+        make_robotics(task)
 
 
 def test_arguments_of_the_library_are_passed_on():

@@ -207,6 +207,14 @@ def test_wrong_arguments_are_named(wrong, message):
         Counters(**{"n_envs": 2} | wrong)
 
 
+@pytest.mark.parametrize("too_large", ["action", "drawn"])  # which one of the two entries alone shows
+def test_observations_of_another_size_than_their_space_are_refused(too_large):
+    env = Counters(2)
+    env.values[too_large] = np.zeros((2, 2))
+    with pytest.raises(ValueError, match=f'"{too_large}" has 2 components, but it is split by position as one of 1:'):
+        env.reset()
+
+
 def test_what_it_cannot_do_is_said():
     env = Counters(1)
     with pytest.raises(RuntimeError, match="Counters must be reset before its first step"):

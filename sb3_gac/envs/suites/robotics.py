@@ -25,9 +25,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_gac.envs.goals import GOALS, AppendDesiredGoal
+from sb3_gac.envs.goals import ACHIEVED_GOAL, GOALS, AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
-from sb3_gac.envs.suites.layout import noisy_with_history
+from sb3_gac.envs.suites.layout import check_size, noisy_with_history
 from sb3_gac.envs.wrappers import Observation, SplitDictObservation, reset_with
 
 PRIVILEGED_CHOICES = ("hidden", "state")
@@ -245,7 +245,7 @@ def make_robotics(
     :param kwargs: keyword arguments of the gymnasium-robotics environment, such as ``reward_type``, except those that change
         its observation
     :return: environment with ``partial`` and ``privileged``
-    :raises ValueError: if an argument is wrong, or is for another kind of task
+    :raises ValueError: if an argument is wrong, is for another kind of task, or makes an observation of another size
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
@@ -259,12 +259,18 @@ def make_robotics(
     env: gym.Env = Robot(found.env_id, goal_entries, **{**found.kwargs, **kwargs})
     if not found.has_goals:
         env = WithSimulatorState(env)
+    check_size(found.env_id, _size_without_achieved_goal(env.observation_space), found.sizes[0] + found.sizes[1])
     visible = found.hidden if privileged == "hidden" else _both(found.partial, found.hidden)
     env = SplitDictObservation(env, found.partial, visible, keep=GOALS if found.has_goals else ())
     env = noisy_with_history(env, noise_std, history, delay, drop)
     if found.has_goals and not goal_entries:
         env = AppendDesiredGoal(env, (PARTIAL, PRIVILEGED) if privileged == "state" else (PARTIAL,))
     return env
+
+
+def _size_without_achieved_goal(space: Any) -> int:
+    """Number of components of a Dict observation, without the achieved goal, which repeats others."""
+    return sum(spaces.flatdim(entry) for key, entry in space.items() if key != ACHIEVED_GOAL)
 
 
 def _both(first: Selection, second: Selection) -> Selection:
