@@ -21,6 +21,7 @@ from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
 from sb3_gac.envs.selections import KeySelection, as_slice, check_indices, check_keys
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, has_channels_last, take_from_box
+from sb3_gac.envs.state import MADE_WITH, layers
 
 Observation = dict[str, np.ndarray]
 #: Samples of the noise that are drawn at once, since one by one takes several times as long; and numbers, for large entries
@@ -185,6 +186,22 @@ class EntryWrapper(gym.Wrapper, ABC):
         observation, reward, terminated, truncated, info = self.env.step(action)
         changed = {**observation, self._key: self._next(observation[self._key], action, reward)}
         return changed, reward, terminated, truncated, info
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """
+        Set an attribute on the outermost layer that has it; a setting, such as ``noise_std``, on every layer that has it.
+
+        :param name: name of the attribute
+        :param value: value of the attribute
+        :param force: whether to create the attribute where no layer has it
+        :return: whether the attribute was set
+        """
+        if name in getattr(self, MADE_WITH, ()):
+            for layer in layers(self):
+                if name in getattr(layer, MADE_WITH, ()):
+                    setattr(layer, name, value)
+            return True
+        return bool(super().set_wrapper_attr(name, value, force=force))
 
     @abstractmethod
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:

@@ -266,8 +266,10 @@ class BatchVecEnv(VecEnv):
         :param attr_name: name of the attribute
         :param value: value for all environments
         :param indices: indices of all environments, or ``None``
-        :raises ValueError: if ``indices`` leaves environments out
+        :raises ValueError: if ``indices`` leaves environments out, or there is no such attribute
         """
+        if not hasattr(self, attr_name):
+            raise ValueError(f"{type(self).__name__} has no attribute {attr_name!r} that could be set.")
         if set(self._list_of(indices)) != set(range(self.num_envs)):
             raise ValueError(f"{attr_name} is one for all environments of {type(self).__name__}: leave indices out.")
         setattr(self, attr_name, value)
