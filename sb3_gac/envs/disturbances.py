@@ -149,13 +149,18 @@ def delayed_and_dropped(env: gym.Env, delay: int, drop: float, key: str = PARTIA
     :raises ValueError: if ``delay`` or ``drop`` is out of its range; the message names the argument
     """
     try:
-        late = env if delay == 0 else SensorDelay(env, delay, key)
+        late = env if _is_zero(delay) else SensorDelay(env, delay, key)
     except ValueError as error:
         raise ValueError(f"delay: {error}") from None
     try:
-        return late if drop == 0 else DroppedFrames(late, drop, key)
+        return late if _is_zero(drop) else DroppedFrames(late, drop, key)
     except ValueError as error:
         raise ValueError(f"drop: {error}") from None
+
+
+def _is_zero(value: object) -> bool:
+    """Whether a value is the number 0; arrays and the like are none, which the wrappers refuse by name."""
+    return np.ndim(value) == 0 and bool(value == 0)  # type: ignore[arg-type]
 
 
 def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 0.0, key: str = PARTIAL) -> gym.Env:

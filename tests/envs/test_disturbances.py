@@ -206,7 +206,10 @@ def test_a_registered_task_remembers_what_has_arrived():
     np.testing.assert_array_equal(seen[1:, 4:], actions, "the action just taken")
 
 
-@pytest.mark.parametrize(("argument", "value"), [("delay", -1), ("delay", 0.5), ("drop", 1.5), ("drop", "a lot")])
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [("delay", -1), ("delay", 0.5), ("drop", 1.5), ("drop", "a lot"), ("drop", np.zeros(2)), ("delay", [1, 2])],
+)
 def test_a_registered_task_names_the_argument(argument, value):
     with pytest.raises(ValueError, match=f"^{argument}: "):
         gym.make("sb3_gac/HalfCheetah-v5", **{argument: value})
