@@ -337,6 +337,15 @@ def test_an_observation_of_another_size_is_refused(task, other, monkeypatch):
         make_robotics(task)
 
 
+@pytest.mark.parametrize("name", ["HandManipulatePenTouch-v1", "HandManipulatePenRotateTouch-v1", PUSH])
+@pytest.mark.parametrize("n_rows", [2, 3, 5])
+def test_rewards_of_many_goals_are_those_of_each(name, n_rows):
+    robot = _one(name, goal_entries=True).unwrapped
+    achieved, desired = np.random.default_rng(0).normal(size=(2, n_rows, *robot.observation_space["desired_goal"].shape))
+    of_each = [robot.compute_reward(*goals, {}) for goals in zip(achieved, desired, strict=True)]
+    np.testing.assert_allclose(robot.compute_reward(achieved, desired, [{}] * n_rows), of_each)
+
+
 def test_arguments_of_the_library_are_passed_on():
     assert _make(PUSH).unwrapped.simulated.reward_type == "sparse"
     assert _make(PUSH, reward_type="dense").unwrapped.simulated.reward_type == "dense"

@@ -18,6 +18,7 @@ Achieved goals are part of these observations already.  ``privileged="state"`` i
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -160,7 +161,8 @@ class Robot(gym.Env):
         self.metadata, self.render_mode = env.metadata, env.render_mode
         self.model, self.data = env.model, env.data
         if rewards_goals:
-            self.compute_reward = env.compute_reward
+            takes_rows = not getattr(env, "ignore_z_target_rotation", False)
+            self.compute_reward = env.compute_reward if takes_rows else partial(_rewards_by_row, env.compute_reward)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
@@ -213,6 +215,17 @@ class Robot(gym.Env):
 
     def __reduce__(self) -> Any:
         return _make_again, self._arguments
+
+
+def _rewards_by_row(compute_reward: Any, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+    """
+    Rewards of rows of goals, one row after the other.
+
+    Where gymnasium-robotics ignores a rotation, as of pens, it copies the third row's angles in place of each row's third.
+    """
+    if np.ndim(achieved) == 1:
+        return compute_reward(achieved, desired, info)
+    return np.array([compute_reward(*goals, {}) for goals in zip(achieved, desired, strict=True)])
 
 
 def _make_again(env_id: str, rewards_goals: bool, kwargs: dict[str, Any]) -> Robot:
