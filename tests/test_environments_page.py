@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gac import GAC
 from sb3_gac.envs.suites import SUITES
@@ -27,6 +28,7 @@ def test_what_a_user_types_runs(monkeypatch):
     assert len(BLOCKS) == 6
     for number, block in enumerate(BLOCKS):
         exec(compile(block.replace("5_000", "160"), f"environments.md and goals.md, block {number}", "exec"), names)
+        assert _ends(names["env"]), f"episodes of block {number} must end"
         shapes.append({key: box.shape for key, box in names["env"].observation_space.items()})
     assert shapes[0] == {"partial": (4 * 6 + 3 * 2,), "privileged": (10,)}
     assert shapes[1] == {"partial": (9,), "privileged": (17,)}
@@ -35,6 +37,14 @@ def test_what_a_user_types_runs(monkeypatch):
     assert shapes[5] == {"partial": (5,), "privileged": (5,), "achieved_goal": (3,), "desired_goal": (3,)}
     assert np.shape(names["action"]) == (4,)
     assert names["model"]._n_updates > 0
+
+
+def _ends(env):
+    """Whether an episode ends: a robot's has a new goal only then. Vectorised environments have trained before."""
+    if isinstance(env, VecEnv):
+        return True
+    env.reset(seed=0)
+    return any(any(env.step(env.action_space.sample())[2:4]) for _ in range(200))
 
 
 def test_tasks_that_are_named_are_registered():

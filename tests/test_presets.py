@@ -42,6 +42,17 @@ def test_preset_merges_policy_kwargs_and_leaves_the_table_alone():
         preset("large")
 
 
+def test_critics_get_all_entries_where_the_privileged_one_is_not_the_whole_state():
+    arguments = {"task": "HalfCheetah", "noise": 0.1}
+    whole = preset("small", **arguments)["role_keys"]
+    assert whole is not None
+    assert preset("small", privileged="state", **arguments)["role_keys"] == whole
+    assert preset("small", privileged="velocity", **arguments)["role_keys"] is None
+    assert preset("small", privileged="velocity", role_keys={"critic": ["partial"]}, **arguments)["role_keys"] == {
+        "critic": ["partial"]
+    }
+
+
 def test_who_changes_what_he_got_does_not_change_the_preset():
     for name in ("small", "paper"):
         arguments = preset(name)

@@ -15,6 +15,7 @@ from sb3_gac.checks.environments import FAULTS, EnvironmentGuard, guard_environm
 from sb3_gac.checks.requirements import check_environment
 from sb3_gac.checks.spaces import check_spaces_of
 from sb3_gac.checks.values import as_sentence
+from sb3_gac.envs.vector.settings import reach_layers
 
 
 class FaultTolerance(BaseAlgorithm):
@@ -43,6 +44,7 @@ class FaultTolerance(BaseAlgorithm):
         check_environment(env)
         wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         guard_environments(wrapped)
+        reach_layers(wrapped)
         return wrapped
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

@@ -102,8 +102,6 @@ class EnvironmentGuard:
             self.base.remotes = tuple(map(WatchedPipe, self.base.remotes, self.base.processes))
             self._close = self.base.close
             vars(self.base)["close"] = self.close
-        if isinstance(self.base, (DummyVecEnv, SubprocVecEnv)):
-            vars(self.base)["set_attr"] = self.set_attr
 
     @property
     def uses(self) -> int:
@@ -161,18 +159,6 @@ class EnvironmentGuard:
         check_rows('The "reward"', rewards, REWARD)
         self._check_ends(observation, dones, infos)
         return observation, rewards, dones, infos
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """
-        Set an attribute of the environments on the outermost layer that has it, such as ``noise_std`` of ``SensorNoise``.
-
-        SB3 sets attributes on the outermost wrapper, ``Monitor`` in most cases, where they do nothing.
-
-        :param attr_name: name of the attribute
-        :param value: value of the attribute
-        :param indices: indices of the environments; ``None`` for all
-        """
-        self.base.env_method("set_wrapper_attr", attr_name, value, indices=indices)
 
     def save_obs(self, index: int, observation: Any) -> None:
         """

@@ -31,7 +31,8 @@ class CameraImage(EntryWrapper):
 
     The image has no shadows, reflections or smooth edges, which makes drawing in software tens of times faster. The
     environment's own ``render`` keeps them. Drawing begins with the first reset. Each image shows the colours, sizes, lights
-    and cameras that the environment's model has then; textures and meshes stay as they were at first.
+    and cameras that the environment's model has then; textures, meshes and heights of a terrain (``hfield_data``) stay as they
+    were at first, also where a reset draws others.
 
     :param env: one of gymnasium's MuJoCo environments, with a Dict observation
     :param size: height and width of the image, in pixels
@@ -39,6 +40,8 @@ class CameraImage(EntryWrapper):
     :param key: key of the entry that the image replaces
     :raises ValueError: if the environment has no such camera or no MuJoCo, or ``size`` is no positive integer
     """
+
+    _makes_anew = True
 
     def __init__(self, env: gym.Env, size: int = 64, camera: str = "track", key: str = PARTIAL):
         super().__init__(env, key)

@@ -12,19 +12,34 @@ another order warn.
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 from sb3_gac.envs.arguments import check_count
-from sb3_gac.envs.goals import AppendDesiredGoal
+from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
-from sb3_gac.envs.wrappers import SENT, EntryWrapper, History, PreviousAction, SensorNoise, count_wrappers, entries_changed_by
+from sb3_gac.envs.wrappers import (
+    RECEIVED,
+    SENT,
+    EntryWrapper,
+    SensorNoise,
+    SplitDictObservation,
+    count_wrappers,
+    entries_changed_by,
+    inward,
+    place_of,
+)
 
 FRAME_STREAM = 0x6672616D65  # separates the losses from generators that others seed with the same number
-#: Wrappers that add values of no sensor to an entry; they stand outside of the sensor's disturbances
-_AFTER_THE_SENSOR = (History, PreviousAction, AppendDesiredGoal)
+#: How to make an environment whose entry can be disturbed
+_HOW = (
+    "Put History and PreviousAction outside of SplitDictObservation; keep a goal as an entry (keep), and put "
+    "AppendDesiredGoal outside."
+)
 
 
 class SensorDelay(EntryWrapper):
@@ -134,13 +149,18 @@ def delayed_and_dropped(env: gym.Env, delay: int, drop: float, key: str = PARTIA
     :raises ValueError: if ``delay`` or ``drop`` is out of its range; the message names the argument
     """
     try:
-        late = env if delay == 0 else SensorDelay(env, delay, key)
+        late = env if _is_zero(delay) else SensorDelay(env, delay, key)
     except ValueError as error:
         raise ValueError(f"delay: {error}") from None
     try:
-        return late if drop == 0 else DroppedFrames(late, drop, key)
+        return late if _is_zero(drop) else DroppedFrames(late, drop, key)
     except ValueError as error:
         raise ValueError(f"drop: {error}") from None
+
+
+def _is_zero(value: object) -> bool:
+    """Whether a value is the number 0; arrays and the like are none, which the wrappers refuse by name."""
+    return np.ndim(value) == 0 and bool(value == 0)  # type: ignore[arg-type]
 
 
 def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 0.0, key: str = PARTIAL) -> gym.Env:
@@ -149,7 +169,8 @@ def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 
 
     The new wrappers stand directly around the sensor's signal, beneath every history, previous action and goal: these are the
     policy's own and need no sensor. New noise stands beneath the environment's own delays and losses as well: a value that is
-    late or shown again keeps the noise of its measurement. The function is for evaluations: the outer wrappers keep the bounds
+    late or shown again keeps the noise of its measurement. A ``SplitDictObservation`` is followed to the entries that it was
+    given. The function is for evaluations: the outer wrappers keep the bounds
     of their spaces, although noisy values may go beyond them.
 
     :param env: environment in its wrappers, changed in place, which must not have been reset yet
@@ -158,38 +179,65 @@ def disturb(env: gym.Env, noise_std: float = 0.0, delay: int = 0, drop: float = 
     :param drop: probability that a value of the entry is lost
     :param key: key of the entry
     :return: the environment, whose outermost layer may be a new wrapper
-    :raises ValueError: if an argument is wrong; the message names it
+    :raises ValueError: if an argument is wrong, and the message names it; or if a ``SplitDictObservation`` over histories or
+        goals makes the entry of values that can't be disturbed for this entry alone
     """
     if noise_std != 0:
-        env = insert_above(env, _measured_layer(env, key), lambda inner: SensorNoise(inner, noise_std, key))
-    return insert_above(env, sensor_layer(env, key), lambda inner: delayed_and_dropped(inner, delay, drop, key))
+        env = _insert(env, key, SENT, lambda source, inner: SensorNoise(inner, noise_std, source))
+    if drop != 0 and len(beneath(env, key, RECEIVED)) > 1:
+        raise ValueError(f'drop: "{key}" is made of several entries, and each would lose other values. {_HOW}')
+    if (delay, drop) != (0, 0):
+        env = _insert(env, key, RECEIVED, lambda source, inner: delayed_and_dropped(inner, delay, drop, source))
+    return env
 
 
-def sensor_layer(env: gym.Env, key: str = PARTIAL) -> gym.Env:
+class Place(NamedTuple):
     """
-    Find the layer at which the sensor's signal ends.
+    A place for a wrapper of an entry.
+
+    :param layer: layer that the wrapper is put around
+    :param key: key of the entry there
+    :param is_shared: whether other entries further out are made of this one as well
+    """
+
+    layer: gym.Env
+    key: str
+    is_shared: bool = False
+
+
+def beneath(env: gym.Env, key: str, place: int) -> list[Place]:
+    """
+    Find the outermost place beneath all wrappers that belong at some place or further out.
+
+    A ``SplitDictObservation`` over such wrappers, or over a desired goal, leads to a place for each of its sources; a goal is
+    a command, and has none.
 
     :param env: environment in its wrappers
-    :param key: key of the sensor's entry
-    :return: outermost layer in which the entry comes from the sensor alone
+    :param key: key of an entry of its observation
+    :param place: ``MEASURED``, ``SENT`` or ``RECEIVED``, of :mod:`sb3_gac.envs.wrappers`
+    :return: outermost place beneath these wrappers, where there are none the whole environment; several where the entry is
+        made of several
     """
-    outside = [
-        number
-        for number, layer in enumerate(layers(env))
-        if isinstance(layer, _AFTER_THE_SENSOR) and key in entries_changed_by(layer)
-    ]
-    return layers(env)[outside[-1] + 1 if outside else 0]
+    inner, found = inward(env, key), []
+    for layer, source in inner:
+        if not source == DESIRED_GOAL != key:
+            is_shared = isinstance(env, SplitDictObservation) and env.shows_elsewhere(source, key)
+            found += [at._replace(is_shared=at.is_shared or is_shared) for at in beneath(layer, source, place)]
+    is_passed = key in entries_changed_by(env) and place_of(env) >= place
+    is_passed_further_in = [(at.layer, at.key) for at in found] != inner
+    return found if is_passed or is_passed_further_in else [Place(env, key)]
 
 
-def _measured_layer(env: gym.Env, key: str) -> gym.Env:
-    """Outermost layer of the sensor beneath all delays and losses of the entry, which come after the measurement."""
-    signal = sensor_layer(env, key)
-    sending = [
-        layer
-        for layer in layers(signal)
-        if isinstance(layer, (SensorDelay, DroppedFrames)) and key in entries_changed_by(layer)
-    ]
-    return sending[-1].env if sending else signal
+def _insert(env: gym.Env, key: str, place: int, wrap: Callable[[str, gym.Env], gym.Env]) -> gym.Env:
+    """Insert wrappers beneath all that belong at a place or further out."""
+    places = beneath(env, key, place)
+    if any(found.is_shared for found in places):
+        raise ValueError(
+            f'"{key}" can\'t be disturbed alone, since SplitDictObservation makes another entry of the same values. {_HOW}'
+        )
+    for found in places:
+        env = insert_above(env, found.layer, partial(wrap, found.key))
+    return env
 
 
 def insert_above(env: gym.Env, layer: gym.Env, wrap: Callable[[gym.Env], gym.Env]) -> gym.Env:

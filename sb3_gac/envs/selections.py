@@ -26,13 +26,31 @@ class BatchSelection:
     def __init__(self, name: str, selection: Indices | KeySelection, space: spaces.Space):
         if isinstance(space, spaces.Box):
             self._parts: dict[str | None, Any] = {None: as_slice(check_indices(name, selection, space))}  # type: ignore[arg-type]
+            self._sizes: dict[str | None, int] = {None: spaces.flatdim(space)}
             self.space = take_from_box(space, self._parts[None])
             return
         if not isinstance(space, spaces.Dict):
             raise ValueError(f"{name} is selected from a Box or a Dict of Boxes, but the observation is {space}.")
         keys = check_keys(name, selection, space)  # type: ignore[arg-type]
         self._parts = {key: as_slice(index) for key, index in keys.items()}
+        self._sizes = {key: spaces.flatdim(box_entry(space, key)) for key in keys}
         self.space = concatenate_boxes([take_from_box(box_entry(space, key), index) for key, index in keys.items()])
+
+    def check_sizes(self, observation: Any) -> None:
+        """
+        Check that observations are as large as their space, for in others the indices are those of other components.
+
+        :param observation: observations of N environments: an array, or arrays by key, each of shape (N, ...)
+        :raises ValueError: if an array has another number of components; the message says how many there are
+        """
+        for key, expected in self._sizes.items():
+            size = _rows(observation if key is None else observation[key]).shape[1]
+            if size != expected:
+                of = "observation" if key is None else f'"{key}"'
+                raise ValueError(
+                    f"The simulator's {of} has {size} components, but it is split by position as one of {expected}: leave out "
+                    "the simulator's arguments that change it."
+                )
 
     def of(self, observation: Any) -> np.ndarray:
         """

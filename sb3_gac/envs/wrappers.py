@@ -10,7 +10,7 @@ Each is a picklable ``gymnasium.Wrapper``, and passes the environment checkers o
 import warnings
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -21,6 +21,7 @@ from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
 from sb3_gac.envs.selections import KeySelection, as_slice, check_indices, check_keys
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, has_channels_last, take_from_box
+from sb3_gac.envs.state import MADE_WITH, layers
 
 Observation = dict[str, np.ndarray]
 #: Samples of the noise that are drawn at once, since one by one takes several times as long; and numbers, for large entries
@@ -119,6 +120,21 @@ class SplitDictObservation(_SplitWrapper):
         }
         return {**split, **{key: observation[key].astype(dtype) for key, dtype in self._kept.items()}}
 
+    def sources(self, key: str) -> list[str]:
+        """
+        :param key: key of an entry
+        :return: keys of the wrapped environment's entries that it is made of
+        """
+        return list(self._selections.get(key, [key]))
+
+    def shows_elsewhere(self, source: str, key: str) -> bool:
+        """
+        :param source: key of an entry of the wrapped environment
+        :param key: key of an entry that is made of it
+        :return: whether another entry is made of it as well
+        """
+        return any(source in self.sources(other) for other in (PARTIAL, PRIVILEGED, *self._kept) if other != key)
+
 
 #: Places of wrappers of an entry, from the inside to the outside: at the sensor, on the way, and in the policy's hands
 MEASURED, SENT, RECEIVED = 0, 1, 2
@@ -129,6 +145,8 @@ class EntryWrapper(gym.Wrapper, ABC):
 
     #: Place among the other wrappers of the entry, ``None`` where any will do
     _place: int | None = None
+    #: Whether the entry no longer depends on the wrapped environment's entry
+    _makes_anew = False
 
     def __init__(self, env: gym.Env, key: str):
         super().__init__(env)
@@ -138,17 +156,14 @@ class EntryWrapper(gym.Wrapper, ABC):
 
     def _warn_of_order(self) -> None:
         """Warn if the wrapper disturbs what was made of the sensor's values further inside."""
-        layer: Any = self.env
-        while self._place is not None and isinstance(layer, gym.Wrapper):
-            place = getattr(type(layer), "_place", None)
-            if place is not None and place > self._place and self._key in entries_changed_by(layer):
+        for layer, key in wrappers_of(self.env, self._key):
+            if self._place is not None and place_of(layer) > self._place:
                 own, inner = type(self).__name__, type(layer).__name__
                 warnings.warn(
-                    f'{own} stands outside of {inner}, and also disturbs what {inner} has made of the entry "{self._key}": '
+                    f'{own} stands outside of {inner}, and also disturbs what {inner} has made of the entry "{key}": '
                     f"make it {inner}({own}(env, ...), ...).",
                     stacklevel=4,
                 )
-            layer = layer.env
 
     def _set_entry_space(self, box: spaces.Box) -> None:
         entries = self.env.observation_space.spaces  # type: ignore[attr-defined]
@@ -171,6 +186,22 @@ class EntryWrapper(gym.Wrapper, ABC):
         observation, reward, terminated, truncated, info = self.env.step(action)
         changed = {**observation, self._key: self._next(observation[self._key], action, reward)}
         return changed, reward, terminated, truncated, info
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """
+        Set an attribute on the outermost layer that has it; a setting, such as ``noise_std``, on every layer that has it.
+
+        :param name: name of the attribute
+        :param value: value of the attribute
+        :param force: whether to create the attribute where no layer has it
+        :return: whether the attribute was set
+        """
+        if name in getattr(self, MADE_WITH, ()):
+            for layer in layers(self):
+                if name in getattr(layer, MADE_WITH, ()):
+                    setattr(layer, name, value)
+            return True
+        return bool(super().set_wrapper_attr(name, value, force=force))
 
     @abstractmethod
     def _first(self, value: np.ndarray, seed: int | None) -> np.ndarray:
@@ -349,6 +380,45 @@ def entries_changed_by(layer: gym.Env) -> Sequence[str]:
     if isinstance(layer, EntryWrapper):
         return [layer._key]
     return getattr(layer, "_to", ()) if isinstance(layer, gym.Wrapper) else ()
+
+
+def place_of(layer: gym.Env) -> int:
+    """
+    :param layer: environment or wrapper
+    :return: place of a wrapper among the others of its entry (``MEASURED``, ``SENT`` or ``RECEIVED``), -1 where any will do
+    """
+    place: int | None = getattr(type(layer), "_place", None)
+    return -1 if place is None else place
+
+
+def inward(layer: gym.Env, key: str) -> list[tuple[gym.Env, str]]:
+    """
+    Follow an entry to the next layer inward, where it may have another key.
+
+    :param layer: environment or wrapper
+    :param key: key of an entry of its observation
+    :return: next layer with the key that the entry has there, once for each entry that it is made of; empty for the
+        environment itself, and for a wrapper that makes the entry anew
+    """
+    if not isinstance(layer, gym.Wrapper) or (getattr(layer, "_makes_anew", False) and key in entries_changed_by(layer)):
+        return []
+    sources = layer.sources(key) if isinstance(layer, SplitDictObservation) else [key]
+    entries = getattr(layer.env.observation_space, "spaces", ())
+    return [(layer.env, source) for source in sources if source in entries]
+
+
+def wrappers_of(env: gym.Env, key: str) -> Iterator[tuple[gym.Env, str]]:
+    """
+    Find the wrappers that an entry's values come through.
+
+    :param env: environment in its wrappers
+    :param key: key of an entry of its observation
+    :return: this package's wrappers that change the entry, from the outermost inward, each with the entry's key there
+    """
+    if key in entries_changed_by(env):
+        yield env, key
+    for inner, source in inward(env, key):
+        yield from wrappers_of(inner, source)
 
 
 def count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:

@@ -13,9 +13,8 @@ import yaml
 from sb3_gac.algorithms import import_path
 from sb3_gac.envs.disturbances import DroppedFrames, SensorDelay, disturb
 from sb3_gac.envs.spaces import PARTIAL
-from sb3_gac.envs.state import layers
 from sb3_gac.envs.suites import SUITES, batch_factory, env_id_of, is_batched, suite_of, without_module
-from sb3_gac.envs.wrappers import SensorNoise
+from sb3_gac.envs.wrappers import SensorNoise, wrappers_of
 from sb3_gac.training.environments import creator_of, in_wrappers
 
 CONFIGURATION = "config.yaml"
@@ -123,7 +122,7 @@ class Environment:
         in an environment that nobody can ask for it. It is empty if there is nothing.
         """
         env = self.make(UNDISTURBED)
-        wrappers = [type(layer).__name__ for layer in layers(env) if _disturbs(layer)]
+        wrappers = [type(layer).__name__ for layer, _ in wrappers_of(env, PARTIAL) if _disturbs(layer)]
         env.close()
         if wrappers:
             return f"what it has of its own: {' and '.join(wrappers)}"

@@ -9,62 +9,59 @@ import gymnasium as gym
 import matplotlib
 import numpy as np
 
-from sb3_gac.envs.camera import CameraImage, no_rendering
-from sb3_gac.envs.disturbances import DroppedFrames, SensorDelay, insert_above, sensor_layer
+from sb3_gac.envs.camera import no_rendering
+from sb3_gac.envs.disturbances import Place, beneath, insert_above
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
 from sb3_gac.envs.suites.extras import import_extra
-from sb3_gac.envs.wrappers import SensorNoise
+from sb3_gac.envs.wrappers import MEASURED, RECEIVED, SplitDictObservation
 from sb3_gac.evaluation.policies import EvaluatedPolicy
 
 EXTRA, PROGRAM = "video", "sb3-gac evaluate --video"
 STRIP, MARGIN, WINDOW = 140, 12, 100  # pixels, pixels, steps
-MEASURED, GOT, PAPER, INK = (120, 120, 120), (230, 100, 0), (255, 255, 255), (30, 30, 30)
+TRUE, GOT, PAPER, INK = (120, 120, 120), (230, 100, 0), (255, 255, 255), (30, 30, 30)
 VIDEOS = (".mp4", ".mkv", ".mov", ".avi")  # endings by which the writer knows what to write
 Series = list[np.ndarray]
 
 
 class Tap(gym.ObservationWrapper):
     """
-    Keep the newest value of ``partial``.
+    Keep the newest value of an entry.
 
-    :param env: environment with an entry ``partial``; its observations stay as they are
+    :param env: environment with the entry; its observations stay as they are
+    :param key: key of the entry
     """
 
-    def __init__(self, env: gym.Env):
+    def __init__(self, env: gym.Env, key: str):
         super().__init__(env)
+        self._key = key
         self.latest = np.empty(0)
 
     def observation(self, observation: Any) -> Any:
         """
         :param observation: observation of the environment
-        :return: the same observation, whose ``partial`` was copied
+        :return: the same observation, of which the entry was copied
         """
-        self.latest = np.array(observation[PARTIAL])
+        self.latest = np.array(observation[self._key])
         return observation
 
 
 def tapped(env: gym.Env) -> tuple[gym.Env, Tap, Tap]:
     """
-    Put two taps into an environment.
+    Put two taps into an environment, at the first sensor that ``partial`` is made of.
 
     :param env: environment in its wrappers, changed in place
     :return: the environment; a tap of the sensor's values without noise; and a tap of the values that arrive
     """
-    arriving = sensor_layer(env)
-    # What is beneath a camera is not what the camera shows
-    on_the_way = takewhile(lambda layer: not isinstance(layer, CameraImage), layers(arriving))
-    disturbing = [layer for layer in on_the_way if isinstance(layer, (SensorNoise, SensorDelay, DroppedFrames))]
-    measured = disturbing[-1].env if disturbing else arriving
-    taps: list[Tap] = []
-
-    def tap(layer: gym.Env) -> gym.Env:
-        taps.append(Tap(layer))
-        return taps[-1]
-
-    env = insert_above(env, measured, tap)
-    outermost = taps[0] if arriving is measured else arriving
-    return insert_above(env, outermost, tap), taps[0], taps[1]
+    arriving = beneath(env, PARTIAL, RECEIVED)[0]
+    measured = beneath(arriving.layer, arriving.key, MEASURED)[0]
+    between = takewhile(lambda layer: layer is not measured.layer, layers(arriving.layer))
+    if splits := [layer for layer in between if isinstance(layer, SplitDictObservation)]:
+        arriving = Place(splits[-1].env, measured.key)  # where both are values of the same entry
+    true = Tap(measured.layer, measured.key)
+    env = insert_above(env, measured.layer, lambda _: true)
+    got = Tap(true if arriving.layer is measured.layer else arriving.layer, arriving.key)
+    return insert_above(env, got.env, lambda _: got), true, got
 
 
 def check_can_film(env: gym.Env, name: str) -> None:
@@ -171,10 +168,10 @@ def _draw_strip(draw: Any, font: Any, series: Series, step: int, box: tuple[int,
     low, high = min(measured.min(), got.min()), max(measured.max(), got.max())
     steps = np.arange(max(step - WINDOW, 0), step + 1)
     x = left + (steps - steps[0]) / min(WINDOW, len(measured) - 1) * (right - left)
-    for values, colour in ((got, GOT), (measured, MEASURED)):
+    for values, colour in ((got, GOT), (measured, TRUE)):
         y = bottom - (values[steps] - low) / max(high - low, 1e-9) * (bottom - top)
         if len(steps) > 1:
             draw.line(list(zip(x.tolist(), y.tolist(), strict=True)), colour, 2)
     draw.text((left, top - 20), f"partial[{component}]:", INK, font)
-    draw.text((left + 90, top - 20), "as it is", MEASURED, font)
+    draw.text((left + 90, top - 20), "as it is", TRUE, font)
     draw.text((left + 160, top - 20), "as the policy gets it", GOT, font)

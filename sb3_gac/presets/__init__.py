@@ -186,7 +186,13 @@ PRESETS: Mapping[str, Preset] = _Presets()
 
 
 def preset(
-    name: str, *, algorithm: str | type = "gac", task: str | None = None, noise: float = 0.0, **overrides: Any
+    name: str,
+    *,
+    algorithm: str | type = "gac",
+    task: str | None = None,
+    noise: float = 0.0,
+    privileged: str | None = None,
+    **overrides: Any,
 ) -> dict[str, Any]:
     """
     The arguments of a preset for an algorithm.
@@ -199,6 +205,8 @@ def preset(
     :param task: task of an environment that is registered as ``sb3_gac/<task>-v5`` or ``sb3_gac/brax-<task>-v0``, or its id,
         whose arguments in the preset count as well; ``None`` for any other environment
     :param noise: standard deviation of the task's sensor noise; see :meth:`Preset.layers` for levels that the preset lacks
+    :param privileged: value of the environment's argument ``privileged``, ``None`` for its default. For any but "state",
+        such as "velocity", ``role_keys`` are left out, since critics then need all entries
     :param overrides: arguments that replace those of the preset; ``policy_kwargs`` are merged. Activation functions and
         optimisers are classes, or names of torch's
     :return: keyword arguments of the algorithm, ``policy`` included where the preset has it
@@ -209,6 +217,8 @@ def preset(
     resolved: dict[str, Any] = {"policy_kwargs": {}}
     for layer in found.layers(kind, task, noise):
         resolved = merge(resolved, layer)
+    if "role_keys" in resolved and privileged not in (None, "state"):
+        resolved = merge(resolved, {"role_keys": None})
     return instantiate(merge(resolved, overrides | {"policy_kwargs": overrides.get("policy_kwargs") or {}}))
 
 

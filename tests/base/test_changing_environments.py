@@ -140,6 +140,26 @@ def test_environments_in_this_process_are_closed_as_before():
     env.close()
 
 
+@pytest.mark.parametrize("cls", [DummyVecEnv, SubprocVecEnv])
+def test_a_setting_is_set_on_all_of_several_sensors_and_on_nothing_else(cls):
+    noisy = [lambda: Monitor(SensorNoise(SensorNoise(TwoViewBandit(), 0.1), 0.1, key="privileged"))]
+    env = small_model(cls(noisy)).env
+    env.set_attr("noise_std", 100.0)
+    values = np.abs([np.concatenate([values[0] for values in env.reset().values()]) for _ in range(20)])
+    assert (values.max(axis=0) > 50).all()
+    if cls is DummyVecEnv:
+        assert env.envs[0].unwrapped.noise_std == 0.0, "what the environment calls so is no setting of a wrapper"
+    env.close()
+
+
+@pytest.mark.parametrize(("name", "argument"), [("steps", "delay"), ("probability", "drop")])
+def test_a_setting_of_a_wrapper_that_is_not_there_is_refused(name, argument):
+    model = small_model(DummyVecEnv([lambda: Monitor(TwoViewBandit())]))
+    with pytest.raises(ValueError, match=f"{name} can't be set, .* or make a registered task with {argument} above 0"):
+        model.env.set_attr(name, 1)
+    assert name not in vars(model.env.unwrapped.envs[0])
+
+
 def _noisy(n_envs, cls):
     return cls([lambda: Monitor(SensorNoise(TwoViewBandit(), 0.1))] * n_envs)
 
@@ -156,6 +176,7 @@ def test_an_attribute_is_set_on_the_layer_that_has_it(cls, wrap):
     if cls is DummyVecEnv:
         assert [float(env.env.noise_std) for env in model.env.unwrapped.envs] == pytest.approx([0.4, 0.7])
         assert "noise_std" not in vars(model.env.unwrapped.envs[0])
-    model.env.set_attr("of_nobody", 3)
+    with pytest.warns(UserWarning, match="No layer of the environments has 'of_nobody'"):
+        model.env.set_attr("of_nobody", 3)
     assert model.env.get_attr("of_nobody") == [3, 3]
     model.env.close()

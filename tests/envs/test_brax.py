@@ -83,6 +83,12 @@ def test_entries_are_positions_and_velocities_of_the_simulators_own_state(brax, 
     assert np.asarray(env._state.obs).shape == (4, whole)
 
 
+def test_arguments_that_change_the_observation_are_refused(brax):
+    env = make_brax("HalfCheetah", exclude_current_positions_from_observation=False)
+    with pytest.raises(ValueError, match="observation has 18 components, but it is split by position as one of 17"):
+        env.reset()
+
+
 def test_humanoids_other_velocities_are_those_of_its_bodies_and_no_torque_is_among_them(brax):
     env = make_vec("sb3_gac/brax-Humanoid-v0", n_envs=4, noise_std=0.0, privileged="velocity", seed=0)
     env.reset()

@@ -8,10 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sb3_gac  # noqa: F401, which registers the environments
-from sb3_gac.envs import DroppedFrames, History, PreviousAction, SensorDelay, SensorNoise, make_vec
-from sb3_gac.envs.disturbances import disturb, sensor_layer
+from sb3_gac.envs import DroppedFrames, History, PreviousAction, SensorDelay, SensorNoise, SplitDictObservation, make_vec
+from sb3_gac.envs.camera import CameraImage
+from sb3_gac.envs.disturbances import beneath, disturb
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.state import env_state, layers, restore_env_state
+from sb3_gac.envs.wrappers import RECEIVED
 from tests.envs.test_wrappers import IMAGE, PAIR, Reusing, Still, Strict
 
 ACTION = np.zeros(1, dtype=np.float32)
@@ -204,7 +206,10 @@ def test_a_registered_task_remembers_what_has_arrived():
     np.testing.assert_array_equal(seen[1:, 4:], actions, "the action just taken")
 
 
-@pytest.mark.parametrize(("argument", "value"), [("delay", -1), ("delay", 0.5), ("drop", 1.5), ("drop", "a lot")])
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [("delay", -1), ("delay", 0.5), ("drop", 1.5), ("drop", "a lot"), ("drop", np.zeros(2)), ("delay", [1, 2])],
+)
 def test_a_registered_task_names_the_argument(argument, value):
     with pytest.raises(ValueError, match=f"^{argument}: "):
         gym.make("sb3_gac/HalfCheetah-v5", **{argument: value})
@@ -221,7 +226,7 @@ def test_vectorised_environments_take_both_and_a_batch_takes_neither():
 
 def test_an_environment_with_wrappers_of_its_own_is_disturbed_beneath_its_memory():
     env = PreviousAction(History(SensorNoise(Counting(), 0.1), 3, actions=True))
-    assert isinstance(sensor_layer(env), SensorNoise)
+    assert beneath(env, "partial", RECEIVED) == [(env.env.env, "partial", False)]
     assert disturb(env, noise_std=0.3, delay=2, drop=0.1) is env
     assert [type(layer) for layer in layers(env)] == [
         PreviousAction,
@@ -281,6 +286,7 @@ def test_added_noise_and_losses_are_independent_of_those_further_out():
             "SensorDelay stands outside of Previous",
         ),
         (lambda: DroppedFrames(History(Still(PAIR), 2), 0.1), 'DroppedFrames stands outside of History.*"partial"'),
+        (lambda: SensorNoise(_split(History(Sensors(), 2, key="joints")), 0.1), 'SensorNoise .* of History.* entry "joints"'),
         (lambda: SensorNoise(AppendDesiredGoal(Still(GOALS)), 0.1), "SensorNoise stands outside of AppendDesiredGoal"),
     ],
 )
@@ -310,6 +316,74 @@ def test_a_goal_is_no_measurement():
 def _seen_of(env):
     actions = np.full((4, 4), 0.5, np.float32)
     return np.stack([env.reset(seed=0)[0]["partial"], *(env.step(action)[0]["partial"] for action in actions)])
+
+
+class Sensors(Counting):
+    """The same with the number of the step in two entries, and a goal."""
+
+    def __init__(self):
+        super().__init__()
+        entry = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.observation_space = spaces.Dict(dict.fromkeys(("joints", "imu", "contacts", "desired_goal"), entry))
+
+    def _observe(self):
+        values = {key: np.full(2, self.count, np.float32) for key in ("joints", "imu", "contacts")}
+        return {**values, "desired_goal": np.full(2, 5, np.float32)}
+
+
+def _split(env, partial=("joints",), privileged=("contacts",), **kwargs):
+    return SplitDictObservation(env, list(partial), list(privileged), **kwargs)
+
+
+def test_a_memory_of_an_entry_that_is_split_later_is_found():
+    env = disturb(_split(History(Sensors(), 3, actions=True, key="joints")), noise_std=0.1, delay=2)
+    kinds = [SplitDictObservation, History, SensorDelay, SensorNoise, Sensors]
+    assert [type(layer) for layer in layers(env)] == kinds
+    env.reset(seed=0)
+    before, now = (env.step(np.full(1, 0.1 * step, np.float32))[0]["partial"] for step in (1, 2))
+    np.testing.assert_array_equal(now[:4], before[2:6], "a value keeps its noise")
+    np.testing.assert_array_equal(now[6:], np.array([0.1, 0.2], np.float32), "actions are the policy's own")
+    assert now[4:6] == pytest.approx(0, abs=0.5)
+
+
+def test_a_goal_that_is_an_entry_of_partial_stays_as_it_is():
+    env = disturb(_split(Sensors(), ("joints", "desired_goal")), noise_std=0.1, delay=1, drop=0.5)
+    seen = _seen(env, 5)
+    assert (seen[:, 2:] == 5).all()
+    assert (seen[:, :2] % 1 != 0).all()
+    kept = disturb(AppendDesiredGoal(_split(Sensors(), keep=["desired_goal"])), noise_std=0.1)
+    assert [type(layer) for layer in layers(kept)] == [AppendDesiredGoal, SensorNoise, SplitDictObservation, Sensors]
+
+
+def test_each_entry_of_several_is_disturbed_beneath_its_own_memory():
+    env = _split(History(SensorDelay(Sensors(), 1, key="joints"), 2, key="joints"), ("joints", "imu"))
+    disturb(env, noise_std=0.1, delay=2)
+    seen, noise = _seen(env, 4), _seen(env, 4)[:, 4:] % 1
+    np.testing.assert_array_equal(seen[1:, :2], seen[:-1, 2:4], "a value keeps its noise")
+    assert seen.round()[-1].tolist() == [0, 0, 1, 1, 2, 2]
+    assert len(np.unique(noise[2:])) == noise[2:].size, "each number has a noise of its own"
+    with pytest.raises(ValueError, match='drop: "partial" is made of several entries'):
+        disturb(env, drop=0.1)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: _split(History(Sensors(), 2, key="joints"), privileged=("joints", "contacts")),
+        lambda: _split(Sensors(), ("joints", "desired_goal"), keep=["joints"]),
+    ],
+)
+def test_what_can_not_be_disturbed_for_one_entry_alone_is_refused(make):
+    assert type(disturb(make())) is SplitDictObservation, "nothing is asked of it"
+    for argument in ("noise_std", "delay", "drop"):
+        with pytest.raises(ValueError, match=r"can't be disturbed alone.* another entry .*AppendDesiredGoal outside"):
+            disturb(make(), **{argument: 1})
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_memory_beneath_a_camera_is_none_of_the_images():
+    env = disturb(CameraImage(gym.make("sb3_gac/Hopper-v5", history=4)), delay=5)
+    assert [type(layer) for layer in layers(env)][:2] == [SensorDelay, CameraImage]
 
 
 def test_an_environment_without_a_memory_gets_a_new_outermost_layer():

@@ -1,6 +1,8 @@
 """MuJoCo tasks: the split against the simulator's own state, noise without effect on the dynamics, time limits, checkers."""
 
 import pickle
+import re
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -252,3 +254,15 @@ def test_passes_arguments_on_to_gymnasium():
 def test_refuses_with_the_culprit_named(task, kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_mujoco(task, **kwargs)
+
+
+@pytest.mark.parametrize("task", ["Hopper", "HopperPixels"])
+@pytest.mark.parametrize("privileged", ["velocity", "state"])
+def test_a_robot_with_another_number_of_joints_is_refused(task, privileged, tmp_path):
+    """By position, its last position would be the first velocity, and its last velocity would be shown nowhere."""
+    text = (Path(gym.__file__).parent / "envs/mujoco/assets/hopper.xml").read_text()
+    toes = '<body><joint name="toes" range="-9 9"/><geom size="0.01"/></body>'
+    file = tmp_path / "hopper.xml"
+    file.write_text(re.sub(r'(<geom [^>]*name="foot_geom"[^>]*/>)', rf"\1{toes}", text))
+    with pytest.raises(ValueError, match=r"Hopper-v5 has 13 components, but it is split by position as one of 11\."):
+        _make(task, xml_file=str(file), privileged=privileged)

@@ -193,6 +193,8 @@ def test_where_mujoco_itself_fails_for_want_of_opengl(monkeypatch):
     [
         ({"task": "Pusher"}, "task must be one of .*HalfCheetah"),
         ({"noise_std": 0.1}, "noise_std must be 0 for images, got 0.1"),
+        ({"noise_std": np.full(3, 0.1)}, "noise_std must be 0 for images"),
+        ({"history": 5}, "history is for vectors.* argument frames"),
         ({"camera": "front"}, r"camera must be one of \['track'\], got 'front'"),
         ({"size": 0}, "size must be an integer of at least 1"),
         ({"size": 64.5}, "size must be an integer of at least 1, in pixels, got 64.5"),

@@ -3,6 +3,7 @@
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from functools import cache
 
 import gymnasium as gym
@@ -326,6 +327,23 @@ def test_a_copy_can_be_made_in_a_process_that_has_made_none(tmp_path):
 def test_refuses_with_the_culprit_named(task, kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_robotics(task, **kwargs)
+
+
+@pytest.mark.parametrize(("task", "other"), [("FetchReach", "FetchPush"), ("AdroitHandDoor", "AdroitHandRelocate")])
+def test_an_observation_of_another_size_is_refused(task, other, monkeypatch):
+    """A later version of the library may change an observation; the split by position would then show other components."""
+    monkeypatch.setitem(TASKS, task, replace(TASKS[task], env_id=TASKS[other].env_id))
+    with pytest.raises(ValueError, match=rf"{other}-v\d has \d+ components, but it is split by position as one of \d+"):
+        make_robotics(task)
+
+
+@pytest.mark.parametrize("name", ["HandManipulatePenTouch-v1", "HandManipulatePenRotateTouch-v1", PUSH])
+@pytest.mark.parametrize("n_rows", [2, 3, 5])
+def test_rewards_of_many_goals_are_those_of_each(name, n_rows):
+    robot = _one(name, goal_entries=True).unwrapped
+    achieved, desired = np.random.default_rng(0).normal(size=(2, n_rows, *robot.observation_space["desired_goal"].shape))
+    of_each = [robot.compute_reward(*goals, {}) for goals in zip(achieved, desired, strict=True)]
+    np.testing.assert_allclose(robot.compute_reward(achieved, desired, [{}] * n_rows), of_each)
 
 
 def test_arguments_of_the_library_are_passed_on():

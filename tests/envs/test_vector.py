@@ -14,6 +14,7 @@ from sb3_gac import GAC
 from sb3_gac.envs import SensorNoise, make_vec
 from sb3_gac.envs.state import layers
 from sb3_gac.envs.suites import SUITES, batch_factory, is_batched, register
+from sb3_gac.envs.vector.settings import reach_layers
 from sb3_gac.envs.vector.single import SingleEnv
 from tests.envs.vector_helpers import Counters, RestorableCounters
 from tests.helpers import small_model
@@ -114,6 +115,22 @@ def test_another_noise_std_counts_from_the_next_step_on():
     assert (env.step(NO_ACTION)[0]["partial"] == 2).all()
     with pytest.raises(ValueError, match="noise_std must be a finite number >= 0"):
         env.set_attr("noise_std", -1.0)
+    with pytest.raises(ValueError, match="Counters has no attribute 'noise_st' that could be set"):
+        env.set_attr("noise_st", 0.1)
+
+
+def test_a_single_environment_passes_settings_on_to_its_simulator():
+    env = SingleEnv(Counters(1, partial=["steps"]))
+    vec_env = DummyVecEnv([lambda: Monitor(SensorNoise(env, 0.1, key="privileged"))])
+    reach_layers(vec_env)
+    vec_env.set_attr("time_limit", 2)
+    vec_env.set_attr("noise_std", 0.5)
+    assert (env.time_limit, env.noise_std) == (env.vec_env.time_limit, env.vec_env.noise_std) == (2, 0.5)
+    assert vec_env.get_attr("noise_std")[0] == 0.5
+    vec_env.reset()
+    observation, *_ = vec_env.step(NO_ACTION[:1])
+    assert (observation["partial"] != 1).all()
+    assert vec_env.step(NO_ACTION[:1])[2].all()
 
 
 def test_noise_is_gaussian_of_the_given_size_and_independent():
@@ -205,6 +222,14 @@ def test_a_monitor_around_it_counts_the_same():
 def test_wrong_arguments_are_named(wrong, message):
     with pytest.raises(ValueError, match=message):
         Counters(**{"n_envs": 2} | wrong)
+
+
+@pytest.mark.parametrize("too_large", ["action", "drawn"])  # which one of the two entries alone shows
+def test_observations_of_another_size_than_their_space_are_refused(too_large):
+    env = Counters(2)
+    env.values[too_large] = np.zeros((2, 2))
+    with pytest.raises(ValueError, match=f'"{too_large}" has 2 components, but it is split by position as one of 1:'):
+        env.reset()
 
 
 def test_what_it_cannot_do_is_said():

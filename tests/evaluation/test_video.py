@@ -10,13 +10,13 @@ import pytest
 from gymnasium import spaces
 
 from sb3_gac import GAC
-from sb3_gac.envs import DroppedFrames, History, SensorDelay, SensorNoise
+from sb3_gac.envs import DroppedFrames, History, SensorDelay, SensorNoise, SplitDictObservation
 from sb3_gac.envs.camera import CameraImage
 from sb3_gac.envs.wrappers import EntryWrapper
 from sb3_gac.evaluate import main
 from sb3_gac.evaluation.policies import learner_of
 from sb3_gac.evaluation.settings import UNDISTURBED, Environment, Setting
-from sb3_gac.evaluation.video import GOT, MEASURED, PAPER, Tap, _composed, film, tapped
+from sb3_gac.evaluation.video import GOT, PAPER, TRUE, Tap, _composed, film, tapped
 from tests.evaluation.helpers import ENV, Walk, noisy_walk
 
 NOISY = "tests.evaluation.helpers:noisy_walk"
@@ -86,7 +86,7 @@ def test_a_frame_has_the_picture_and_both_lines_in_their_colours():
     np.testing.assert_array_equal(frame[top : top + 41, :301], picture)
     strip = frame[top + 41 + 26 :]
     rows = {}
-    for name, colour in (("measured", MEASURED), ("got", GOT)):
+    for name, colour in (("measured", TRUE), ("got", GOT)):
         y, x = np.nonzero((strip == colour).all(axis=-1))
         assert x.max() - x.min() > 250, "from one side to the other"
         assert np.corrcoef(x, y)[0, 1] < -0.9, "it rises: component 1, which moves most"
@@ -160,6 +160,16 @@ def test_what_is_beneath_a_camera_is_not_what_it_shows():
     env, measured, got = tapped(SensorDelay(Lens(SensorNoise(Walk(), 0.5)), 2))
     (true, seen), _ = _stepped(env, (measured, got))
     assert true.shape == seen.shape == (13, 2, 2, 3)
+
+
+def test_both_taps_are_at_one_sensor_beneath_a_split():
+    selected = {"partial": {"partial": [1], "privileged": None}, "privileged": ["privileged"]}
+    env = History(SplitDictObservation(SensorDelay(SensorNoise(Walk(), 0.5), 2), **selected), 2)
+    env, *taps = tapped(env)
+    (true, seen), newest = _stepped(env, taps)
+    np.testing.assert_array_equal(true[:, 1], np.arange(13))
+    assert seen[-1][1] == newest[2]
+    assert not np.isclose(seen, true).any()
 
 
 def test_a_film_may_have_a_fraction_of_frames_in_a_second(tmp_path):

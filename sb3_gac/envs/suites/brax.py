@@ -68,7 +68,8 @@ def make_brax(
     :param privileged: "state" for the whole clean state, "velocity" for velocities alone
     :param backend: physics of Brax: "spring" as in the paper, "positional", "generalized" or "mjx"
     :param time_limit: number of steps after which an episode is truncated
-    :param kwargs: keyword arguments of Brax's environment
+    :param kwargs: keyword arguments of Brax's environment, except those that change its observation, with which the first
+        reset raises a ``ValueError``
     :return: vectorised environments
     :raises ValueError: if ``task`` or ``privileged`` is unknown, or ``noise_std`` is negative
     :raises ImportError: if Brax is not installed; the message says how to install it
@@ -81,12 +82,11 @@ def make_brax(
     from sb3_gac.envs.vector.jax_env import JaxVecEnv
 
     env = envs.get_environment(layout.env_id, backend=backend, **kwargs)
-    size = len(layout.partial) + len(layout.velocity)
     return JaxVecEnv(
         env,
         n_envs,
         EXTRA,
-        observation_space=spaces.Box(-np.inf, np.inf, (size,), np.float32),
+        observation_space=spaces.Box(-np.inf, np.inf, (layout.size,), np.float32),
         action_space=spaces.Box(-1.0, 1.0, (_ACTIONS[task],), np.float32),
         partial=layout.partial,
         privileged=visible,

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
+from gymnasium import spaces
 
 from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.disturbances import delayed_and_dropped
@@ -21,26 +22,50 @@ class TaskLayout:
     :param partial: indices of positions and other quantities without velocities
     :param velocity: indices of velocities
     :param kwargs: keyword arguments for ``gymnasium.make``
+    :param n_unused: number of components in neither selection
     """
 
     env_id: str
     partial: tuple[int, ...]
     velocity: tuple[int, ...]
     kwargs: dict[str, Any] = field(default_factory=dict)
+    n_unused: int = 0
+
+    @property
+    def size(self) -> int:
+        """Number of the observation's components."""
+        return len(self.partial) + len(self.velocity) + self.n_unused
 
 
-def positions_first(env_id: str, n_positions: int, n_velocities: int, **kwargs: Any) -> TaskLayout:
+def positions_first(env_id: str, n_positions: int, n_velocities: int, n_unused: int = 0, **kwargs: Any) -> TaskLayout:
     """
     Make the layout of an observation that begins with positions, followed by velocities.
 
     :param env_id: simulator's own id of the task
     :param n_positions: number of positions, at the observation's beginning
     :param n_velocities: number of velocities, after the positions
+    :param n_unused: number of components after the velocities, which no entry shows
     :param kwargs: keyword arguments for ``gymnasium.make``
     :return: layout of the task's observation
     """
-    size = n_positions + n_velocities
-    return TaskLayout(env_id, tuple(range(n_positions)), tuple(range(n_positions, size)), kwargs)
+    end = n_positions + n_velocities
+    return TaskLayout(env_id, tuple(range(n_positions)), tuple(range(n_positions, end)), kwargs, n_unused)
+
+
+def check_size(name: str, size: int, expected: int) -> None:
+    """
+    Check that an observation is as large as the split by position takes it to be.
+
+    :param name: simulator's own id of the task, for the message
+    :param size: number of the observation's components
+    :param expected: number of components that the split is for
+    :raises ValueError: if the numbers differ
+    """
+    if size != expected:
+        raise ValueError(
+            f"The observation of {name} has {size} components, but it is split by position as one of {expected}. Leave out "
+            "the arguments that change it; or make the simulator's own environment, and split it by SplitObservation."
+        )
 
 
 def visible_in(layout: TaskLayout, privileged: str) -> tuple[int, ...]:
@@ -75,10 +100,11 @@ def make_task(
     :param drop: probability that an observation of ``partial`` is lost, and the last one shown again
     :param kwargs: further keyword arguments for ``gymnasium.make``, which override those of the layout
     :return: environment with ``partial`` and ``privileged``
-    :raises ValueError: if an argument is wrong; the message names it
+    :raises ValueError: if an argument is wrong, or ``kwargs`` make an observation of another size, as another robot has
     """
     visible = visible_in(layout, privileged)
     env = gym.make(layout.env_id, disable_env_checker=True, max_episode_steps=-1, **{**layout.kwargs, **kwargs}).unwrapped
+    check_size(layout.env_id, spaces.flatdim(env.observation_space), layout.size)
     return noisy_with_history(SplitObservation(env, layout.partial, visible), noise_std, history, delay, drop)
 
 

@@ -43,7 +43,7 @@ TASKS: dict[str, TaskLayout] = {
     "Ant": positions_first("Ant-v5", 13, 14, include_cfrc_ext_in_observation=False),
     "Humanoid": _humanoid("Humanoid-v5"),
     "HumanoidStandup": _humanoid("HumanoidStandup-v5"),
-    "InvertedDoublePendulum": positions_first("InvertedDoublePendulum-v5", 5, 3),
+    "InvertedDoublePendulum": positions_first("InvertedDoublePendulum-v5", 5, 3, n_unused=1),
     "Hopper": positions_first("Hopper-v5", 5, 6),
     "Walker2d": positions_first("Walker2d-v5", 8, 9),
     "Swimmer": positions_first("Swimmer-v5", 3, 5),

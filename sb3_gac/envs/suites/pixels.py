@@ -9,6 +9,7 @@ draws with OpenGL; :data:`sb3_gac.envs.camera.HOW_TO_RENDER` says how to enable 
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.camera import CameraImage, no_rendering
@@ -48,11 +49,13 @@ def make_pixels(
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {list(TASKS)}, got {task!r}.")
-    if noise_std:
+    if np.any(noise_std):
         raise ValueError(
             f"noise_std must be 0 for images, got {noise_std!r}: it is in the units of positions, and noise that is drawn for "
             "each pixel by itself hides nothing from an encoder, which averages over many."
         )
+    if kwargs.pop("history", 1) != 1:
+        raise ValueError("history is for vectors, beneath the camera: the number of images in partial is the argument frames.")
     frames = check_count("frames", frames)
     try:
         import mujoco  # noqa: F401  # looks for OpenGL at once, where MUJOCO_GL says of which kind

@@ -18,6 +18,7 @@ Achieved goals are part of these observations already.  ``privileged="state"`` i
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -25,9 +26,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_gac.envs.goals import GOALS, AppendDesiredGoal
+from sb3_gac.envs.goals import ACHIEVED_GOAL, GOALS, AppendDesiredGoal
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED
-from sb3_gac.envs.suites.layout import noisy_with_history
+from sb3_gac.envs.suites.layout import check_size, noisy_with_history
 from sb3_gac.envs.wrappers import Observation, SplitDictObservation, reset_with
 
 PRIVILEGED_CHOICES = ("hidden", "state")
@@ -160,7 +161,8 @@ class Robot(gym.Env):
         self.metadata, self.render_mode = env.metadata, env.render_mode
         self.model, self.data = env.model, env.data
         if rewards_goals:
-            self.compute_reward = env.compute_reward
+            takes_rows = not getattr(env, "ignore_z_target_rotation", False)
+            self.compute_reward = env.compute_reward if takes_rows else partial(_rewards_by_row, env.compute_reward)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
@@ -215,6 +217,17 @@ class Robot(gym.Env):
         return _make_again, self._arguments
 
 
+def _rewards_by_row(compute_reward: Any, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+    """
+    Rewards of rows of goals, one row after the other.
+
+    Where gymnasium-robotics ignores a rotation, as of pens, it copies the third row's angles in place of each row's third.
+    """
+    if np.ndim(achieved) == 1:
+        return compute_reward(achieved, desired, info)
+    return np.array([compute_reward(*goals, {}) for goals in zip(achieved, desired, strict=True)])
+
+
 def _make_again(env_id: str, rewards_goals: bool, kwargs: dict[str, Any]) -> Robot:
     return Robot(env_id, rewards_goals, **kwargs)
 
@@ -245,7 +258,7 @@ def make_robotics(
     :param kwargs: keyword arguments of the gymnasium-robotics environment, such as ``reward_type``, except those that change
         its observation
     :return: environment with ``partial`` and ``privileged``
-    :raises ValueError: if an argument is wrong, or is for another kind of task
+    :raises ValueError: if an argument is wrong, is for another kind of task, or makes an observation of another size
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {sorted(TASKS)}, got {task!r}.")
@@ -259,12 +272,18 @@ def make_robotics(
     env: gym.Env = Robot(found.env_id, goal_entries, **{**found.kwargs, **kwargs})
     if not found.has_goals:
         env = WithSimulatorState(env)
+    check_size(found.env_id, _size_without_achieved_goal(env.observation_space), found.sizes[0] + found.sizes[1])
     visible = found.hidden if privileged == "hidden" else _both(found.partial, found.hidden)
     env = SplitDictObservation(env, found.partial, visible, keep=GOALS if found.has_goals else ())
     env = noisy_with_history(env, noise_std, history, delay, drop)
     if found.has_goals and not goal_entries:
         env = AppendDesiredGoal(env, (PARTIAL, PRIVILEGED) if privileged == "state" else (PARTIAL,))
     return env
+
+
+def _size_without_achieved_goal(space: Any) -> int:
+    """Number of components of a Dict observation, without the achieved goal, which repeats others."""
+    return sum(spaces.flatdim(entry) for key, entry in space.items() if key != ACHIEVED_GOAL)
 
 
 def _both(first: Selection, second: Selection) -> Selection:

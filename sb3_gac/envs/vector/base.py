@@ -162,7 +162,8 @@ class BatchVecEnv(VecEnv):
         Begin new episodes in all environments.
 
         :return: first observations of new episodes, seeded if :meth:`seed` was called since the last reset
-        :raises ValueError: if :meth:`set_options` was given options, which this class does not take; the next reset is without
+        :raises ValueError: if :meth:`set_options` was given options, which this class does not take, and the next reset is
+            without; or if the simulator's observations are of another size than their space
         """
         if any(options := self._options):
             self._reset_options()  # or the next reset would be refused as well
@@ -174,6 +175,8 @@ class BatchVecEnv(VecEnv):
         else:
             raw = self.start(self._seeds)  # type: ignore[arg-type]
             self._noise = np.random.default_rng([self._seeds[0], NOISE_STREAM])
+        for selection in (self._partial, self._privileged):
+            selection.check_sizes(raw)
         self._has_started = True
         self._reset_seeds()
         self._begin(np.arange(self.num_envs))
@@ -263,8 +266,10 @@ class BatchVecEnv(VecEnv):
         :param attr_name: name of the attribute
         :param value: value for all environments
         :param indices: indices of all environments, or ``None``
-        :raises ValueError: if ``indices`` leaves environments out
+        :raises ValueError: if ``indices`` leaves environments out, or there is no such attribute
         """
+        if not hasattr(self, attr_name):
+            raise ValueError(f"{type(self).__name__} has no attribute {attr_name!r} that could be set.")
         if set(self._list_of(indices)) != set(range(self.num_envs)):
             raise ValueError(f"{attr_name} is one for all environments of {type(self).__name__}: leave indices out.")
         setattr(self, attr_name, value)

@@ -1,6 +1,5 @@
 """Vectorised environments by id: a suite's own where its simulator steps a batch, SB3's for all others."""
 
-from functools import partial
 from typing import Any
 
 from stable_baselines3.common.env_util import make_vec_env
@@ -8,6 +7,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gac.envs.arguments import check_count
 from sb3_gac.envs.suites import is_batched, make_batch
+from sb3_gac.envs.vector.settings import reach_layers
 
 
 def make_vec(env_id: str, n_envs: int = 1, seed: int | None = None, **kwargs: Any) -> VecEnv:
@@ -19,8 +19,8 @@ def make_vec(env_id: str, n_envs: int = 1, seed: int | None = None, **kwargs: An
     :param n_envs: number of environments side by side
     :param seed: seed of the first environment, while the others have the next ones; ``None`` for a random seed
     :param kwargs: keyword arguments of the environment, such as ``noise_std``
-    :return: vectorised environments whose infos have returns and lengths of episodes, and whose ``set_attr`` reaches the layer
-        that has the attribute
+    :return: vectorised environments whose infos have returns and lengths of episodes, and whose ``set_attr`` reaches the
+        layers that have the attribute
     :raises ImportError: if the simulator is not installed; the message says how to install it
     :raises ValueError: if ``n_envs`` is no positive integer, or if a simulator that steps a batch is asked for a history, a
         delay or losses
@@ -28,18 +28,9 @@ def make_vec(env_id: str, n_envs: int = 1, seed: int | None = None, **kwargs: An
     n_envs = check_count("n_envs", n_envs)
     if not is_batched(env_id):
         made = make_vec_env(env_id, n_envs, seed=seed, env_kwargs=kwargs)
-        vars(made)["set_attr"] = partial(_set_on_the_layer_that_has_it, made)
+        reach_layers(made)
         return made
     env: VecEnv = make_batch(env_id, n_envs, **kwargs)
     env.action_space.seed(seed)
     env.seed(seed)
     return env
-
-
-def _set_on_the_layer_that_has_it(env: VecEnv, attr_name: str, value: Any, indices: Any = None) -> None:
-    """
-    Set an attribute of the environments where it counts, such as ``noise_std`` of ``SensorNoise``.
-
-    SB3 sets attributes on the outermost wrapper, ``Monitor``, where they do nothing.
-    """
-    env.env_method("set_wrapper_attr", attr_name, value, indices=indices)

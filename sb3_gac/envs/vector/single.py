@@ -1,5 +1,6 @@
 """One environment of a simulator that steps many, as a ``gymnasium.Env``."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -25,6 +26,32 @@ class SingleEnv(gym.Env):
         self.vec_env = vec_env
         self.observation_space, self.action_space = vec_env.observation_space, vec_env.action_space
         self._next_first: dict[str, np.ndarray] | None = None
+
+    @property
+    def _settings_made_with(self) -> Mapping[str, Any]:
+        """The simulator's settings; a checkpoint has them with the simulator's state."""
+        made_with: Mapping[str, Any] = self.vec_env._settings_made_with
+        return made_with
+
+    @property
+    def noise_std(self) -> np.ndarray:
+        """Standard deviation of the noise on ``partial`` from the next step on."""
+        noise_std: np.ndarray = self.vec_env.noise_std
+        return noise_std
+
+    @noise_std.setter
+    def noise_std(self, noise_std: Any) -> None:
+        self.vec_env.noise_std = noise_std
+
+    @property
+    def time_limit(self) -> int | None:
+        """Number of steps after which an episode is truncated."""
+        time_limit: int | None = self.vec_env.time_limit
+        return time_limit
+
+    @time_limit.setter
+    def time_limit(self, time_limit: int | None) -> None:
+        self.vec_env.time_limit = time_limit
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
