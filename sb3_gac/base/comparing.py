@@ -1,5 +1,6 @@
 """Comparison of two policies of an algorithm by the returns of the episodes in which each has acted."""
 
+import warnings
 from abc import abstractmethod
 from typing import Any
 
@@ -41,6 +42,20 @@ class ReturnComparison(EpisodeHooks):
         :return: roles of those of the two policies that never act, so that there would be no comparison
         """
         return [role for role in self.returns if not behaviour.acts(role)]
+
+    def warn_of_idle_policies(self, what: str, behaviour: Behaviour) -> None:
+        """
+        Warn if one of the two policies never acts.
+
+        :param what: subject of the message, which the comparison was to change
+        :param behaviour: shares of the policies in the data
+        """
+        if idle := self.idle_policies(behaviour):
+            warnings.warn(
+                f"{what} stays as it is, since episodes of {' and '.join(self.returns)} are compared, but behaviour gives "
+                f"none to {' and '.join(idle)}: give each a share, or leave behaviour out.",
+                stacklevel=3,
+            )
 
     @abstractmethod
     def compare(self, difference: float) -> None:

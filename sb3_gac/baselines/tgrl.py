@@ -1,6 +1,5 @@
 """Teacher-Guided RL: an actor imitates a frozen teacher for as long as the imitation raises its return."""
 
-import warnings
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -118,16 +117,9 @@ class TGRL(ReturnComparison, AsymmetricOffPolicyAlgorithm):  # type: ignore[over
         if self.recording is not None:
             raise ValueError("TGRL compares its actors' episodes, but no actor acts on a recording: leave recording out.")
         if self.n_steps != 1:
-            raise ValueError(
-                f"n_steps must be 1 for TGRL, got {self.n_steps}: its teacher_critic sums up the KL of every step, and "
-                "batches lack the observations in between."
-            )
-        if self.behaviour is not None and self.coef_step and (idle := self.idle_policies(self._make_behaviour())):
-            warnings.warn(
-                "The teacher's weight stays as it is, since TGRL compares episodes of actor and auxiliary, but behaviour "
-                f"gives none to {' and '.join(idle)}: give each a share, or leave behaviour out.",
-                stacklevel=2,
-            )
+            raise ValueError(f"n_steps must be 1 for TGRL, which needs the KL of every step, got {self.n_steps}.")
+        if self.behaviour is not None and self.coef_step:
+            self.warn_of_idle_policies("The teacher's weight", self._make_behaviour())
 
     def make_coefficients(self) -> dict[str, Coefficient]:
         """The entropy temperature and the weight of the teacher."""

@@ -152,7 +152,7 @@ def test_a_weight_that_can_not_move_is_told(behaviour, idle):
 
 
 def test_steps_in_between_would_be_missing():
-    with pytest.raises(ValueError, match="n_steps must be 1 for TGRL, got 3: its teacher_critic"):
+    with pytest.raises(ValueError, match="n_steps must be 1 for TGRL, which needs the KL of every step, got 3"):
         _model(n_steps=3)
 
 
