@@ -31,6 +31,7 @@ _HEADROOM = {
     "less": "SAC on the full state ends below SAC-asym, by {value}: with these steps it is not the upper bound that it should "
     "be. It has more inputs to learn from; give it more --steps before you trust the headroom.",
     "unknown": "The headroom, the full state over SAC-asym, can't be told: {value}.",
+    "unlearned": "The headroom, the full state over SAC-asym, can't be told, since neither has learned: {value}.",
 }
 _IN_TRAINING = {
     "more": "Privileged information in training alone is worth {value}: so much do critics that see it add to SAC on partial.",
@@ -38,12 +39,16 @@ _IN_TRAINING = {
     "far as SAC-asym.",
     "less": "Critics that see the privileged entries do harm ({value}): what they know, the policy can't make use of.",
     "unknown": "Whether critics that see the privileged entries help can't be told: SAC-asym over SAC on partial is {value}.",
+    "unlearned": "Whether critics that see the privileged entries help can't be told, since neither SAC-asym nor SAC on "
+    "partial has learned: their difference is {value}.",
 }
 _GUIDER = {
     "more": "A guider is worth {value} on top of such critics: GAC over SAC-asym.",
     "same": "A guider changes next to nothing on top of such critics, {value}: GAC and SAC-asym come about equally far.",
     "less": "A guider costs return here: GAC over SAC-asym is {value}.",
     "unknown": "Whether a guider adds to such critics can't be told: GAC over SAC-asym is {value}.",
+    "unlearned": "Whether a guider adds to such critics can't be told, since neither GAC nor SAC-asym has learned: their "
+    "difference is {value}.",
 }
 
 

@@ -38,7 +38,7 @@ def write_together(texts: Mapping[Path, str]) -> None:
     """
     temporaries = {path: path.with_name(f"{path.name}.tmp") for path in texts}
     for path, temporary in temporaries.items():
-        with temporary.open("w") as file:
+        with temporary.open("w", encoding="utf-8") as file:
             file.write(texts[path])
             file.flush()
             os.fsync(file.fileno())
@@ -51,7 +51,7 @@ def read_seconds(path: Path) -> float:
     :param path: path of a run's ``timing.json``
     :return: seconds from the run's start to its last evaluation, 0 if there is no file
     """
-    return float(json.loads(path.read_text())["seconds"]) if path.exists() else 0.0
+    return float(json.loads(path.read_text(encoding="utf-8"))["seconds"]) if path.exists() else 0.0
 
 
 def write_timing(path: Path, seconds: float, steps: int, learner: float) -> None:
@@ -117,7 +117,7 @@ class SB3Checkpoints(ExactCheckpoints):
                     model.load_replay_buffer(path / "replay_buffer.pkl")
                 _restore_statistics(env, path / STATISTICS)
                 model.set_random_seed(hash((seed, model.num_timesteps)) % 2**31)
-                return model, _as_state(json.loads((path / "history.json").read_text()))
+                return model, _as_state(json.loads((path / "history.json").read_text(encoding="utf-8")))
         return None
 
     def callback(self, evaluation: SeededEvalCallback, every: int) -> BaseCallback:

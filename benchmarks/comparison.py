@@ -293,7 +293,7 @@ def untrained_returns(spec: RunSpec, path: Path) -> dict[str, np.ndarray]:
     what |= code_of(spec)
     recorded = json.loads(json.dumps(what, default=str))
     try:
-        known = json.loads(path.read_text())
+        known = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):  # the second where a full disk has cut the file off
         known = {}
     if known.get("of") != recorded:

@@ -142,7 +142,7 @@ def _differences_table(found: Worth) -> str:
 
 
 def _how(found: Worth, command: str, results: Path, steps: int) -> str:
-    made = json.loads(results.read_text())
+    made = json.loads(results.read_text(encoding="utf-8"))
     seeds = max(len(end) for end in found.ends.values())
     origin = {
         key: made[key]

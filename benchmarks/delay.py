@@ -183,7 +183,7 @@ def main() -> None:
     parser.add_argument("--out", required=True, help="path of the results, without a suffix")
     args = parser.parse_args()
     path = file_of(Path(args.out), "json")
-    saved = json.loads(path.read_text())["trials"] if path.exists() else []
+    saved = json.loads(path.read_text(encoding="utf-8"))["trials"] if path.exists() else []
     known = {Trial(*(row[key] for key in Trial._fields)): row for row in saved}
     wanted = [Trial(*key) for key in itertools.product(CONTENDERS, args.delays, range(args.seeds), [args.steps])]
     rows = [known[trial] for trial in wanted if trial in known]

@@ -31,7 +31,7 @@ def run_process(command: list[str], log: Path, folder: Path | None = None) -> in
     :param folder: folder in which the process starts, for the relative paths of environments; ``None`` for the present one
     :return: exit status of the process
     """
-    with log.open("a") as file:
+    with log.open("a", encoding="utf-8") as file:
         file.write(f"{ATTEMPT}{shlex.join(command)}\n")
         file.flush()
         return subprocess.run(

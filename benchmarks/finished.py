@@ -113,7 +113,7 @@ def is_finished(spec: RunSpec, runs: Path) -> bool:
     directory = spec.directory(runs)
     if not (directory / "evaluations.csv").exists():
         return False
-    if changed := _changed(spec, yaml.safe_load((directory / "config.yaml").read_text())):
+    if changed := _changed(spec, yaml.safe_load((directory / "config.yaml").read_text(encoding="utf-8"))):
         hint = "remove it, or use another directory (--runs, or --out of a comparison)"
         raise ValueError(f"{directory} holds a run with other settings under {changed}: {hint}.")
     return True
@@ -168,13 +168,13 @@ def read_directory(spec: RunSpec, runs: Path) -> FinishedRun:
     :return: records of the run
     """
     directory = spec.directory(runs)
-    configuration = yaml.safe_load((directory / "config.yaml").read_text())
+    configuration = yaml.safe_load((directory / "config.yaml").read_text(encoding="utf-8"))
     return FinishedRun(
         spec,
         pd.read_csv(directory / "evaluations.csv"),
         _recorded_arguments(spec, configuration["arguments"]),
         made_with(configuration),
-        json.loads((directory / "timing.json").read_text())["seconds"],
+        json.loads((directory / "timing.json").read_text(encoding="utf-8"))["seconds"],
         configuration["cpus"],
         _normalize_in(configuration),
     )
@@ -247,7 +247,7 @@ def read_results(path: Path, specs: Sequence[RunSpec]) -> dict[str, FinishedRun]
     :return: run's name -> records of each run that was found, if it was made with the settings and arguments of today's suite
     :raises ValueError: if the results have no record of single runs
     """
-    results = from_json(json.loads(file_of(path, "json").read_text()))
+    results = from_json(json.loads(file_of(path, "json").read_text(encoding="utf-8")))
     if "runs" not in results:
         raise ValueError(
             f"{file_of(path, 'json')} does not tell its runs apart: it was aggregated before they could be taken up again."

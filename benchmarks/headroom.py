@@ -73,23 +73,29 @@ class Worth(NamedTuple):
 
     @property
     def deployable_span(self) -> float:
-        """The learned return of the best algorithm that can be deployed, so that one that can't be does not make it larger."""
-        best = max((float(self.ends[name].mean()) for name in self.deployable), default=math.nan)
+        """
+        The learned return of the best algorithm that can be deployed, so that one that can't be does not make it larger; NaN
+        if none of them has learned.
+        """
+        best = max((float(self.ends[name].mean()) for name in self.deployable if name in self.learned), default=math.nan)
         return best - self.untrained[self.floor][0]
 
     def span_of(self, one: Difference) -> float:
         """
         :param one: difference of two algorithms
-        :return: learned return that the difference is a share of: that of the deployable ones, if both are
+        :return: learned return that the difference is a share of: that of the deployable ones, if both are; NaN if none of
+            these has learned
         """
         return self.deployable_span if {one.better, one.other} <= set(self.deployable) else self.span
 
     def verdict(self, one: Difference) -> str:
         """
         :param one: difference of two algorithms
-        :return: "same", "more", "less" or "unknown", see :meth:`Difference.verdict`
+        :return: "same", "more", "less" or "unknown", see :meth:`Difference.verdict`; "unlearned" if there is no learned return
+            that the difference could be a share of
         """
-        return one.verdict(NEGLIGIBLE * self.span_of(one))
+        span = self.span_of(one)
+        return "unlearned" if math.isnan(span) else one.verdict(NEGLIGIBLE * span)
 
 
 def worth(tidy: pd.DataFrame, untrained: Mapping[str, np.ndarray], deployable: Collection[str]) -> Worth:

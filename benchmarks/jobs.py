@@ -62,7 +62,7 @@ def last_evaluation(job: Job) -> tuple[int, float | None]:
         first evaluation
     """
     try:
-        last = json.loads((job.directory / TIMING).read_text())
+        last = json.loads((job.directory / TIMING).read_text(encoding="utf-8"))
         return int(last["steps"]), float(last["learner"])
     except (OSError, ValueError, KeyError, TypeError):
         return 0, None

@@ -68,7 +68,7 @@ def about_changed_code(specs: Iterable[RunSpec], runs: Path) -> list[str]:
         path = spec.directory(runs) / "config.yaml"
         if not path.exists():
             continue
-        before = made_with(yaml.safe_load(path.read_text()))
+        before = made_with(yaml.safe_load(path.read_text(encoding="utf-8")))
         key = str(spec.environment)
         now[key] = now.get(key) or code_of(spec)
         for name, digits in now[key].items():

@@ -32,7 +32,7 @@ def read_rows(directory: Path) -> Rows:
     if not path.exists():
         return []
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8") as file:
             rows = [{name: float(text) for name, text in row.items()} for row in csv.DictReader(file)]
         return [{**row, "timesteps": int(row["timesteps"]), "learner": row["learner"]} for row in rows]
     except (KeyError, TypeError, ValueError) as error:
@@ -60,7 +60,7 @@ class Request:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        asked = json.loads(self.path.read_text())
+        asked = json.loads(self.path.read_text(encoding="utf-8"))
         #: Settings of the run
         self.spec = RunSpec(**asked["run"])
         #: The program's own arguments

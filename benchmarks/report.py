@@ -169,7 +169,7 @@ def main() -> None:
     options = parser.parse_args()
     try:
         tidy = read_tidy(file_of(options.results, "csv"))
-        results = with_all_digits(json.loads(file_of(options.results, "json").read_text()), tidy)
+        results = with_all_digits(json.loads(file_of(options.results, "json").read_text(encoding="utf-8")), tidy)
     except OSError as error:
         sys.exit(str(error))
     if options.own_steps:
@@ -178,7 +178,7 @@ def main() -> None:
         with_needed_steps(tidy), [file_of(options.results, suffix) for suffix in options.formats], results.get("still_to_run")
     )
     runs = os.path.relpath(options.runs, options.results.parent)
-    file_of(options.results, "html").write_text(page(tidy, results, options.results.name, runs))
+    file_of(options.results, "html").write_text(page(tidy, results, options.results.name, runs), encoding="utf-8")
     print(f"{cells_table(results['cells'])}\n\n{overall_table(results)}")
 
 

@@ -106,7 +106,7 @@ def check_unfinished(spec: RunSpec, root: Path) -> None:
 def _refuse_other_settings(path: Path, algorithm_class: type, configuration: dict[str, Any]) -> None:
     """Refuse to go on with an unfinished run that was begun with other settings: two runs are never mixed."""
     if path.exists():
-        before = yaml.safe_load(path.read_text())
+        before = yaml.safe_load(path.read_text(encoding="utf-8"))
         now, then = (_comparable(algorithm_class, one) for one in (configuration, before))
         changed = [key for key in dict.fromkeys((*configuration, "normalize")) if then.get(key) != now.get(key)]
         if changed:
@@ -132,7 +132,7 @@ def _write_configuration(path: Path, configuration: dict[str, Any], resumed: boo
     """
     now = provenance()
     now["versions"] = {**now["versions"], **versions}
-    before = made_with(yaml.safe_load(path.read_text())) if resumed else []
+    before = made_with(yaml.safe_load(path.read_text(encoding="utf-8"))) if resumed else []
     earlier = [origin for origin in before if origin not in made_with(now)]
     write_atomically(path, yaml.safe_dump(configuration | now | {"earlier": earlier}, sort_keys=False))
 

@@ -209,12 +209,12 @@ def _in_words(speed: Speed) -> list[str]:
 
 def _write(path: Path, env_id: str, n_envs: int, speed: Speed) -> None:
     """Add a measurement to the file."""
-    found = json.loads(path.read_text()) if path.exists() else {}
+    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     one = {name: _rounded(value) for name, value in speed._asdict().items() if value is not None}
     found.setdefault("columns of overheads", ["median", "lower quartile", "upper quartile"])
     found.setdefault("made with", {}).update(_versions(), cores=usable_processors())
     found.setdefault("environments", {}).setdefault(env_id, {})[str(n_envs)] = one
-    path.write_text(json.dumps(found, indent=1) + "\n")
+    path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 def _versions() -> dict[str, str]:

@@ -53,7 +53,7 @@ class ProgressCallback(BaseCallback):
 
     def _write(self, event: str) -> None:
         memory = psutil.Process().memory_info().rss / MEGABYTE
-        with self._path.open("a") as file:
+        with self._path.open("a", encoding="utf-8") as file:
             file.write(f"{event},{self.num_timesteps},{memory:.1f}\n")
 
 
@@ -83,7 +83,9 @@ def work(directory: Path, steps: int, interval: int, seed: int) -> None:
         model.learn(left, reset_num_timesteps=False, callback=callbacks)
     finally:
         parameters = [value.double().sum().item().hex() for value in model.get_parameters()["policy"].values()]
-        (directory / "end.json").write_text(json.dumps({"steps": model.num_timesteps, "parameters": parameters}))
+        (directory / "end.json").write_text(
+            json.dumps({"steps": model.num_timesteps, "parameters": parameters}), encoding="utf-8"
+        )
 
 
 def disturb(
@@ -125,7 +127,7 @@ def _command(directory: Path, arguments: list[str]) -> list[str]:
 
 def _starts(directory: Path) -> int:
     path = directory / "progress.csv"
-    return path.read_text().count("start") if path.exists() else 0
+    return path.read_text(encoding="utf-8").count("start") if path.exists() else 0
 
 
 def losses(lines: list[str]) -> list[int]:
@@ -162,7 +164,7 @@ def main() -> None:
     report = soak(options)
     print(json.dumps(report, indent=1))
     if options.out:
-        options.out.write_text(json.dumps(report, indent=1))
+        options.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
 
 
 def soak(options: argparse.Namespace) -> dict[str, Any]:
@@ -181,9 +183,9 @@ def soak(options: argparse.Namespace) -> dict[str, Any]:
     kills = disturb(disturbed, [*common, f"--steps={FOREVER}"], until, options.kills, tuple(options.pause), options.seed)
     minutes = (time.time() - started) / 60
     asked = [f"--minutes {options.minutes:g}", f"--kills {options.kills}", *common]
-    end = json.loads((disturbed / "end.json").read_text())
+    end = json.loads((disturbed / "end.json").read_text(encoding="utf-8"))
     subprocess.run(_command(undisturbed, [*common, f"--steps={end['steps']}"]), check=True)
-    lines = (disturbed / "progress.csv").read_text().splitlines()
+    lines = (disturbed / "progress.csv").read_text(encoding="utf-8").splitlines()
     memory = [float(line.split(",")[2]) for line in lines if line.startswith("step")]
     lost = losses(lines)
     return {
@@ -195,7 +197,7 @@ def soak(options: argparse.Namespace) -> dict[str, Any]:
         "checkpoint_interval": options.interval,
         "steps_lost": {"largest": max(lost, default=0), "all": lost},
         "memory_mb": {"first": memory[0], "last": memory[-1], "largest": max(memory)},
-        "same_as_undisturbed": end == json.loads((undisturbed / "end.json").read_text()),
+        "same_as_undisturbed": end == json.loads((undisturbed / "end.json").read_text(encoding="utf-8")),
     }
 
 

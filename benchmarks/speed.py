@@ -106,7 +106,7 @@ def main() -> None:
     path = file_of(options.out, "json")
     for name in options.tables:
         rows = TABLES[name](options.threads, options.quick)
-        before = json.loads(path.read_text()) if path.exists() else {}
+        before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         write_atomically(path, json.dumps(with_table(before, name, rows, made_with), indent=1))
         print(f"\n{name}\n\n{markdown(rows)}", flush=True)
 

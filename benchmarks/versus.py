@@ -161,7 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             **provenance(),
             "rows": rows,
         }
-        options.out.write_text(json.dumps(record, indent=1) + "\n")
+        options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

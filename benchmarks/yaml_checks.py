@@ -29,7 +29,7 @@ def read_yaml(path: Path) -> Any:
     :raises ValueError: naming the line, if the file is not YAML, or if a key comes twice in a mapping
     """
     try:
-        return yaml.load(path.read_text(), _DistinctKeys)
+        return yaml.load(path.read_text(encoding="utf-8"), _DistinctKeys)
     except yaml.YAMLError as error:
         raise ValueError(f"{path.name} is not YAML: {error}") from None
 

@@ -237,11 +237,15 @@ class Evaluation:
         :param command: command line that made the results
         """
         lines = [self._row(*of) for of in self._all()]
-        (self.directory / "evaluation.md").write_text(f"{self.title}\n\n{in_columns(self.header, lines)}\n\n{LEGEND}\n")
+        (self.directory / "evaluation.md").write_text(
+            f"{self.title}\n\n{in_columns(self.header, lines)}\n\n{LEGEND}\n", encoding="utf-8"
+        )
         labels = {name: f"{name} (reads {', '.join(policy.entries)})" for name, policy in self.policies.items()}
         draw(self.outcomes, self.curves, self.trained, labels, self.title, self.directory / "evaluation.png")
         results = [{**setting._asdict(), "policy": name, **found.as_json()} for setting, name, found in self._all()]
-        (self.directory / "evaluation.json").write_text(json.dumps({**self._origin(command), "results": results}, indent=1))
+        (self.directory / "evaluation.json").write_text(
+            json.dumps({**self._origin(command), "results": results}, indent=1), encoding="utf-8"
+        )
 
     def _all(self) -> list[tuple[Setting, str, Outcome]]:
         return [(setting, name, found) for setting, of in self.outcomes.items() for name, found in of.items()]

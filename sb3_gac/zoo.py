@@ -236,7 +236,9 @@ def with_hyperparameters(options: list[str], directory: Path) -> list[str]:
     if known.conf_file is not None or known.algo not in ALGORITHMS:
         return options
     path = directory / f"{known.algo}.yml"
-    path.write_text(yaml.safe_dump(hyperparameters(known.algo, known.env_kwargs.get("privileged")), sort_keys=False))
+    path.write_text(
+        yaml.safe_dump(hyperparameters(known.algo, known.env_kwargs.get("privileged")), sort_keys=False), encoding="utf-8"
+    )
     return [*options, "--conf-file", str(path)]
 
 

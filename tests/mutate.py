@@ -105,7 +105,11 @@ class Mutant:
 @cache
 def _names_in(path: Path) -> set[str]:
     """Of functions and classes."""
-    return {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
+    return {
+        node.name
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef))
+    }
 
 
 def read_mutants(paths: Iterable[Path]) -> list[Mutant]:

@@ -136,3 +136,31 @@ def test_a_baseline_is_a_short_file_of_its_own(path):
             matches = SequenceMatcher(None, _code(path), _code(other), autojunk=False).get_matching_blocks()
             shared = sum(match.size for match in matches if match.size >= 3)
             assert shared < 0.2 * len(_code(path)), f"{shared} of {len(_code(path))} lines are those of {other.name}"
+
+
+def _without_encoding(path):
+    """Lines on which a file is read or written as text in the locale's encoding, which is not UTF-8 everywhere."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call):
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            mode = next((one.value for one in node.args if isinstance(one, ast.Constant)), "r")
+            opens_text = (
+                name == "open" and "b" not in str(mode) and getattr(getattr(node.func, "value", None), "id", "") != "os"
+            )
+            if (opens_text or name in ("read_text", "write_text")) and "encoding" not in [one.arg for one in node.keywords]:
+                yield f"{path.name}:{node.lineno}"
+
+
+@pytest.mark.parametrize("folder", ["sb3_gac", "benchmarks"])
+def test_text_is_utf_8_whatever_the_locale(folder):
+    files = list((PACKAGE.parent / folder).rglob("*.py"))
+    assert len(files) > 30
+    assert [place for path in files for place in _without_encoding(path)] == []
+
+
+def test_text_in_the_locales_encoding_is_found(tmp_path):
+    code = (
+        'p.read_text()\np.write_text("é")\nopen(p)\np.open("rb")\nos.open(p, 1)\np.open("w", encoding="utf-8")\np.open("a")\n'
+    )
+    (tmp_path / "one.py").write_text(code, encoding="utf-8")
+    assert list(_without_encoding(tmp_path / "one.py")) == ["one.py:1", "one.py:2", "one.py:3", "one.py:7"]

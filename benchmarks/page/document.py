@@ -44,7 +44,7 @@ def document(title: str, body: str) -> str:
     :param body: HTML of the page's body, which contains :func:`tabs`
     :return: HTML of a page whose script draws the plots and sorts tables
     """
-    style, script = ((HERE / name).read_text() for name in ("page.css", "page.js"))
+    style, script = ((HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

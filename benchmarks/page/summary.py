@@ -4,6 +4,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from benchmarks.page.cells import title_of
+from benchmarks.tidy import NO_NOISE
+
 SURE = 0.5  # probability of improvement at which neither algorithm is better
 #: Smallest number of seeds whose bootstrap intervals support a verdict. Where two algorithms are equal in one cell, the
 #: interval of the probability of improvement leaves 0.5 out in 6 to 8% of all cases with five seeds, in 17 to 20% with three,
@@ -56,7 +59,10 @@ def _highest(results: dict[str, Any]) -> list[str]:
         return []
     counts = Counter(cell["algorithm"] for cell in best.values()).most_common()
     if len(best) == 1:
-        return [f"{counts[0][0]} has the highest mean return at the end."]
+        ((task, noise),) = best
+        title = title_of(task, NO_NOISE if noise is None else noise)
+        where = f" on {title}, the only cell with several algorithms" if len(several) > 1 else ""
+        return [f"{counts[0][0]} has the highest mean return at the end{where}."]
     (first, count), *others = counts
     rest = "".join(f", {name} in {number}" for name, number in others)
     return [f"{first} has the highest mean return at the end in {count} of {len(best)} cells{rest}."]

@@ -154,20 +154,32 @@ def with_surroundings(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 def differences_table(arguments: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict[str, Any]]:
     """
     :param arguments: algorithm in a cell, such as "gac, Hopper, noise 0.1" -> the algorithm's arguments there
-    :return: HTML of a table of the arguments in which algorithms differ, each with those of its first cell; and the arguments
-        that all algorithms share
+    :return: HTML of a table of the arguments in which algorithms or cells differ, and the arguments that all algorithms share
+        in all cells
     """
-    flat: dict[str, dict[str, Any]] = {}
-    for kind, of_kind in arguments.items():
-        flat.setdefault(kind.split(", ")[0], dict(_flat(of_kind)))
-    names = list(dict.fromkeys(name for of_algorithm in flat.values() for name in of_algorithm))
+    flat = {kind: dict(_flat(of_kind)) for kind, of_kind in arguments.items()}
+    by_algorithm: dict[str, dict[str, dict[str, Any]]] = {}
+    for kind, of_kind in flat.items():
+        algorithm, _, cell = kind.partition(", ")
+        by_algorithm.setdefault(algorithm, {})[cell] = of_kind
+    names = list(dict.fromkeys(name for of_kind in flat.values() for name in of_kind))
     shared = {name: next(iter(flat.values()))[name] for name in names if _is_shared(name, list(flat.values()))}
     rows = [
-        ([Field(name), *(Field(_in_words(of_algorithm.get(name, ""))) for of_algorithm in flat.values())], False)
+        ([Field(name), *(Field(_of_cells(name, cells)) for cells in by_algorithm.values())], False)
         for name in names
         if name not in shared
     ]
-    return table(["argument", *flat], rows, sortable=False) if rows else "<p>They have the same arguments.</p>", shared
+    return table(["argument", *by_algorithm], rows, sortable=False) if rows else "<p>They have the same arguments.</p>", shared
+
+
+def _of_cells(name: str, cells: Mapping[str, Mapping[str, Any]]) -> str:
+    """The value of an argument; if it differs from cell to cell, each value with the cells that have it."""
+    having: dict[str, list[str]] = {}
+    for cell, arguments in cells.items():
+        having.setdefault(_in_words(arguments.get(name, "")), []).append(cell)
+    if len(having) == 1:
+        return next(iter(having))
+    return "; ".join(f"{value or 'none'} ({', '.join(those)})" for value, those in having.items())
 
 
 def _flat(arguments: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

@@ -81,7 +81,7 @@ class Figure(NamedTuple):
 
 def read_figures() -> dict[int, Figure]:
     """Read the figures of ``figures.yml``, by number."""
-    content = yaml.safe_load((HERE / "paper/figures.yml").read_text())
+    content = yaml.safe_load((HERE / "paper/figures.yml").read_text(encoding="utf-8"))
     return {
         number: Figure(
             number, one["title"], {scale: [Group(**group) for group in one[scale]] for scale in SCALES}, one["differs"]
@@ -112,7 +112,7 @@ def needs(name: str) -> str:
     path = RESULTS / f"{name}.json"
     if not path.exists():
         return f"{steps}, none of them made yet"
-    results = json.loads(path.read_text())
+    results = json.loads(path.read_text(encoding="utf-8"))
     made, aside = (sum(name_of(spec) in results.get(key, {}) for spec in specs) for key in ("runs", "set_aside"))
     said = "all made" if made == len(specs) else f"{made} of them made"
     median = results["seconds_per_run"].get("median")

@@ -17,7 +17,7 @@ from sb3_gac.presets import preset, read_preset
 OURS = "small"
 NOISES = (0.0, 0.1, 0.2, 0.3)
 NOT_SET = "by default"
-_CONTENT = yaml.safe_load((HERE / "paper/tables.yml").read_text())
+_CONTENT = yaml.safe_load((HERE / "paper/tables.yml").read_text(encoding="utf-8"))
 
 
 def settings(number: int) -> str:

@@ -26,7 +26,7 @@ def locked(directory: Path, file: str = "lock") -> Iterator[None]:
     :param file: name of the file in the directory that carries the lock; it is made if there is none, and is left as it is
     :raises InUseError: if another process is making the run
     """
-    with (directory / file).open("a") as held:
+    with (directory / file).open("a", encoding="utf-8") as held:
         if fcntl is not None:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -94,7 +94,7 @@ def write_diagnosis(diagnosis: dict[str, Any], directory: str | None, step: int)
         return None
     path = Path(directory) / f"divergence_{step}.json"
     try:
-        path.write_text(json.dumps(diagnosis, indent=2))
+        path.write_text(json.dumps(diagnosis, indent=2), encoding="utf-8")
     except OSError:
         return None
     return path

@@ -208,7 +208,7 @@ def environment_of_run(directory: Path) -> Environment | None:
 def _configuration(path: Path) -> Mapping[str, Any]:
     """Settings of a run, empty where the file is missing or holds something else."""
     try:
-        content = yaml.safe_load(path.read_text()) if path.is_file() else None
+        content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
     except (UnicodeDecodeError, yaml.YAMLError):
         return {}
     run = content.get("run", content) if isinstance(content, Mapping) else None

@@ -116,7 +116,7 @@ def read_preset(name: str) -> Preset:
     path = DIRECTORY / f"{name}.yml"
     if not path.exists():
         raise ValueError(f"preset must be one of {sorted(PRESETS)}, got {name!r}.{meant(str(name), PRESETS)}")
-    content = yaml.safe_load(path.read_text())
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
     extends = isinstance(content, Mapping) and "extends" in content
     _check(path.name, content, {"extends", *_PARTS}, set() if extends else {"run", "arguments"})
     _check(f"{path.name}, run", content.get("run", {}), _OF_RUN, set() if extends else {"envs"})

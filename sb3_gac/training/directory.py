@@ -78,7 +78,7 @@ def _configuration(directory: Path) -> Mapping[str, Any]:
     if not path.is_file():
         raise ValueError(f"--resume {directory}: there is no {CONFIGURATION} in it, so it is no run's directory.")
     try:
-        content = yaml.safe_load(path.read_text())
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise ValueError(f"--resume {directory}: {CONFIGURATION} is no YAML: {error}") from None
     missing = [name for name in _REQUIRED if name not in content] if isinstance(content, Mapping) else _REQUIRED
@@ -153,7 +153,7 @@ def write_at_once(path: Path, text: str) -> None:
     :param text: new content of the file
     """
     temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(text)
+    temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
 
 
@@ -182,7 +182,7 @@ def summary(directory: Path, options: Namespace, entries: Sequence[str] = (PARTI
     :param remembers: whether the learner has a memory, whose state goes from one action to the next
     :return: text with the results, and how to use the learner
     """
-    results = json.loads((directory / RESULTS).read_text())
+    results = json.loads((directory / RESULTS).read_text(encoding="utf-8"))
     name = algorithm_class(options.algorithm).__name__
     learner = f"{shown(results['learner'])} +- {shown(results['learner_std'])}"
     untrained = ", ".join(f"{name} {shown(mean)} +- {shown(std)}" for name, (mean, std) in results["untrained"].items())

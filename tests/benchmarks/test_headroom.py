@@ -108,6 +108,25 @@ def test_what_can_not_be_told_is_said_with_the_seeds_that_would_tell():
     )
 
 
+def test_where_nothing_that_can_be_deployed_has_learned_there_are_no_shares_and_no_seeds_to_ask_for():
+    found = _worth(sac_full=[100, 101, 99], sac_asym=[0, 0.1, -0.1], gac=[-1, -2, 0], sac=[-3, -2, -1])
+    assert found.learned == ["sac-full"]
+    assert math.isnan(found.deployable_span)
+    assert seeds_to_see(found) is None
+    headroom, in_training, guider = findings(found)
+    assert "100% of what was learned" in headroom
+    assert in_training.startswith(
+        "Whether critics that see the privileged entries help can't be told, since neither SAC-asym nor"
+    )
+    assert guider.startswith(
+        "Whether a guider adds to such critics can't be told, since neither GAC nor SAC-asym has learned: "
+    )
+    said = recommendation(found, 1000)
+    assert said[0].startswith("None that can be deployed has learned")
+    assert "of what was learned" not in in_training + guider
+    assert not any("seeds" in sentence or "would most likely" in sentence for sentence in said)
+
+
 def test_an_algorithm_that_may_be_lower_by_chance_alone_is_not_recommended_for_being_simple():
     found = _worth(sac_asym=[90, 10], gac=[80, 15], sac=[60, 0])
     first, second, third, fourth, fifth = recommendation(found, 1000)
@@ -248,8 +267,8 @@ def test_numbers_have_three_digits_or_all_before_the_point():
 
 
 def test_a_difference_in_words_where_nothing_varies():
-    found = _worth(sac=[1.0, 1.0], sac_asym=[2.0, 2.0])
-    assert in_words(found, found.in_training) == "1.00 (1.00 to 1.00 with 95% confidence; 50% of what was learned)"
+    found = _worth(sac=[100.0, 100.0], sac_asym=[200.0, 200.0])
+    assert in_words(found, found.in_training) == "100 (100 to 100 with 95% confidence; 50% of what was learned)"
 
 
 def test_the_ends_of_aggregated_results_by_hand():

@@ -1,5 +1,7 @@
 """The page's sentences and tables, without a browser."""
 
+import re
+
 import pytest
 
 from benchmarks.page.document import _about_intervals, normalised_returns
@@ -52,6 +54,17 @@ def test_who_comes_first_and_how_sure_that_is():
     assert seeds == "3 seeds are few: an interval of their mean is 4.3 standard errors to either side (Student's t)."
     assert in_short(_results(seeds=5))[1].endswith("with probability 0.80 (95% interval 0.60 to 0.90), beyond chance.")
     assert in_short(_results(low=0.4, seeds=5))[1].endswith("which these runs can't tell from chance.")
+
+
+def test_the_only_cell_with_several_algorithms_is_named():
+    results = _results()
+    results["cells"] = results["cells"][:3]  # of noise 0.3, one algorithm alone is left
+    assert (
+        in_short(results)[0]
+        == "gac has the highest mean return at the end on T, noise 0.1, the only cell with several algorithms."
+    )
+    results["cells"] = results["cells"][:2]
+    assert in_short(results)[0] == "gac has the highest mean return at the end."
 
 
 @pytest.mark.parametrize(("seeds", "said"), [(1, "1 seed of"), (2, "2 seeds of"), (4, "4 seeds of"), (5, "beyond chance")])
@@ -123,14 +136,19 @@ def test_the_better_algorithm_is_the_first_row_of_the_overall_table():
 
 def test_arguments_that_all_share_are_told_apart_from_those_that_differ():
     arguments = {
-        "gac, T, noise 0.1": {"tau": 0.1, "policy_kwargs": {"net_arch": [1, 2], "n": 1}},
-        "gac, T, noise 0.3": {"tau": 0.5},
-        "sac, T, noise 0.1": {"tau": 0.1, "policy_kwargs": {"net_arch": [1, 2], "n": 2}, "own": True},
+        "gac, T, noise 0.1": {"gamma": 1, "tau": 0.1, "policy_kwargs": {"net_arch": [1, 2], "n": 1}},
+        "gac, T, noise 0.3": {"gamma": 1, "tau": 0.5},
+        "sac, T, noise 0.1": {"gamma": 1, "tau": 0.1, "policy_kwargs": {"net_arch": [1, 2], "n": 2}, "own": True},
     }
     shown, shared = differences_table(arguments)
-    assert shared == {"tau": 0.1, "policy_kwargs.net_arch": [1, 2]}
-    assert "<td class=short-text>policy_kwargs.n</td><td class=short-text>1</td><td class=short-text>2</td>" in shown
-    assert "own" in shown
+    assert shared == {"gamma": 1}
+    for row in (
+        ["tau", "0.1 (T, noise 0.1); 0.5 (T, noise 0.3)", "0.1"],
+        ["policy_kwargs.net_arch", "1, 2 (T, noise 0.1); none (T, noise 0.3)", "1, 2"],
+        ["policy_kwargs.n", "1 (T, noise 0.1); none (T, noise 0.3)", "2"],
+        ["own", "", "True"],
+    ):
+        assert "".join(f"<td>{text}</td>" for text in row) in re.sub(r"<td [^>]*>", "<td>", shown)
     assert differences_table({"gac, T": {"tau": 1}})[0] == "<p>They have the same arguments.</p>"
 
 
