@@ -41,7 +41,7 @@ class CameraImage(EntryWrapper):
     :raises ValueError: if the environment has no such camera or no MuJoCo, or ``size`` is no positive integer
     """
 
-    _makes_anew = True
+    makes_anew = True
 
     def __init__(self, env: gym.Env, size: int = 64, camera: str = "track", key: str = PARTIAL):
         super().__init__(env, key)

@@ -19,20 +19,11 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_gac.envs.arguments import check_count
+from sb3_gac.envs.entries import RECEIVED, SENT, count_wrappers, entries_changed_by, inward, place_of
 from sb3_gac.envs.goals import DESIRED_GOAL
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
-from sb3_gac.envs.wrappers import (
-    RECEIVED,
-    SENT,
-    EntryWrapper,
-    SensorNoise,
-    SplitDictObservation,
-    count_wrappers,
-    entries_changed_by,
-    inward,
-    place_of,
-)
+from sb3_gac.envs.wrappers import EntryWrapper, SensorNoise, SplitDictObservation
 
 FRAME_STREAM = 0x6672616D65  # separates the losses from generators that others seed with the same number
 #: How to make an environment whose entry can be disturbed
@@ -214,7 +205,7 @@ def beneath(env: gym.Env, key: str, place: int) -> list[Place]:
 
     :param env: environment in its wrappers
     :param key: key of an entry of its observation
-    :param place: ``MEASURED``, ``SENT`` or ``RECEIVED``, of :mod:`sb3_gac.envs.wrappers`
+    :param place: ``MEASURED``, ``SENT`` or ``RECEIVED``, of :mod:`sb3_gac.envs.entries`
     :return: outermost place beneath these wrappers, where there are none the whole environment; several where the entry is
         made of several
     """

@@ -7,8 +7,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_gac.envs.entries import RECEIVED
 from sb3_gac.envs.spaces import PARTIAL, box_entry, concatenate_boxes, take_from_box
-from sb3_gac.envs.wrappers import RECEIVED, Observation, reset_with
+from sb3_gac.envs.wrappers import Observation, reset_with
 
 ACHIEVED_GOAL, DESIRED_GOAL = GOALS = ("achieved_goal", "desired_goal")
 
@@ -43,6 +44,11 @@ class AppendDesiredGoal(gym.Wrapper):
         joined = {key: concatenate_boxes([entry, goal]) for key, entry in entries.items()}
         self._types = {key: entry.dtype for key, entry in entries.items()}
         self.observation_space = spaces.Dict({**kept, **joined})
+
+    @property
+    def changed_entries(self) -> Sequence[str]:
+        """Keys of the entries that get the goal, see :func:`sb3_gac.envs.entries.entries_changed_by`."""
+        return self._to
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """

@@ -10,7 +10,7 @@ Each is a picklable ``gymnasium.Wrapper``, and passes the environment checkers o
 import warnings
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -18,6 +18,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_gac.envs.arguments import check_count
+from sb3_gac.envs.entries import MEASURED, RECEIVED, count_wrappers, place_of, wrappers_of
 from sb3_gac.envs.noise import NOISE_STREAM, check_noise_std, noisy_box
 from sb3_gac.envs.selections import KeySelection, as_slice, check_indices, check_keys
 from sb3_gac.envs.spaces import PARTIAL, PRIVILEGED, box_entry, concatenate_boxes, has_channels_last, take_from_box
@@ -136,23 +137,24 @@ class SplitDictObservation(_SplitWrapper):
         return any(source in self.sources(other) for other in (PARTIAL, PRIVILEGED, *self._kept) if other != key)
 
 
-#: Places of wrappers of an entry, from the inside to the outside: at the sensor, on the way, and in the policy's hands
-MEASURED, SENT, RECEIVED = 0, 1, 2
-
-
 class EntryWrapper(gym.Wrapper, ABC):
     """Base of wrappers that change one entry of a Dict observation."""
 
     #: Place among the other wrappers of the entry, ``None`` where any will do
     _place: int | None = None
     #: Whether the entry no longer depends on the wrapped environment's entry
-    _makes_anew = False
+    makes_anew = False
 
     def __init__(self, env: gym.Env, key: str):
         super().__init__(env)
         self._key = key
         self._entry = box_entry(env.observation_space, key)
         self._warn_of_order()
+
+    @property
+    def changed_entries(self) -> Sequence[str]:
+        """Keys of the entries that the wrapper changes, see :func:`sb3_gac.envs.entries.entries_changed_by`."""
+        return (self._key,)
 
     def _warn_of_order(self) -> None:
         """Warn if the wrapper disturbs what was made of the sensor's values further inside."""
@@ -370,68 +372,6 @@ class PreviousAction(EntryWrapper):
         if self._reward:
             added[-1] = reward
         return np.concatenate([value, added], dtype=self._entry.dtype)
-
-
-def entries_changed_by(layer: gym.Env) -> Sequence[str]:
-    """
-    :param layer: environment or wrapper
-    :return: keys of the entries that it changes, if it is one of this package's wrappers of entries, else none
-    """
-    if isinstance(layer, EntryWrapper):
-        return [layer._key]
-    return getattr(layer, "_to", ()) if isinstance(layer, gym.Wrapper) else ()
-
-
-def place_of(layer: gym.Env) -> int:
-    """
-    :param layer: environment or wrapper
-    :return: place of a wrapper among the others of its entry (``MEASURED``, ``SENT`` or ``RECEIVED``), -1 where any will do
-    """
-    place: int | None = getattr(type(layer), "_place", None)
-    return -1 if place is None else place
-
-
-def inward(layer: gym.Env, key: str) -> list[tuple[gym.Env, str]]:
-    """
-    Follow an entry to the next layer inward, where it may have another key.
-
-    :param layer: environment or wrapper
-    :param key: key of an entry of its observation
-    :return: next layer with the key that the entry has there, once for each entry that it is made of; empty for the
-        environment itself, and for a wrapper that makes the entry anew
-    """
-    if not isinstance(layer, gym.Wrapper) or (getattr(layer, "_makes_anew", False) and key in entries_changed_by(layer)):
-        return []
-    sources = layer.sources(key) if isinstance(layer, SplitDictObservation) else [key]
-    entries = getattr(layer.env.observation_space, "spaces", ())
-    return [(layer.env, source) for source in sources if source in entries]
-
-
-def wrappers_of(env: gym.Env, key: str) -> Iterator[tuple[gym.Env, str]]:
-    """
-    Find the wrappers that an entry's values come through.
-
-    :param env: environment in its wrappers
-    :param key: key of an entry of its observation
-    :return: this package's wrappers that change the entry, from the outermost inward, each with the entry's key there
-    """
-    if key in entries_changed_by(env):
-        yield env, key
-    for inner, source in inward(env, key):
-        yield from wrappers_of(inner, source)
-
-
-def count_wrappers(env: gym.Env, kind: type[gym.Wrapper]) -> int:
-    """
-    :param env: environment in its wrappers
-    :param kind: class of a wrapper
-    :return: number of its layers of that class
-    """
-    count = 0
-    while isinstance(env, gym.Wrapper):
-        count += isinstance(env, kind)
-        env = env.env
-    return count
 
 
 def _check_kept(keep: Sequence[str]) -> Sequence[str]:

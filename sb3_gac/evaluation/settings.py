@@ -12,9 +12,10 @@ import yaml
 
 from sb3_gac.algorithms import import_path
 from sb3_gac.envs.disturbances import DroppedFrames, SensorDelay, disturb
+from sb3_gac.envs.entries import wrappers_of
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.suites import SUITES, batch_factory, env_id_of, is_batched, suite_of, without_module
-from sb3_gac.envs.wrappers import SensorNoise, wrappers_of
+from sb3_gac.envs.wrappers import SensorNoise
 from sb3_gac.training.environments import creator_of, in_wrappers
 
 CONFIGURATION = "config.yaml"

@@ -11,10 +11,11 @@ import numpy as np
 
 from sb3_gac.envs.camera import no_rendering
 from sb3_gac.envs.disturbances import Place, beneath, insert_above
+from sb3_gac.envs.entries import MEASURED, RECEIVED
 from sb3_gac.envs.spaces import PARTIAL
 from sb3_gac.envs.state import layers
 from sb3_gac.envs.suites.extras import import_extra
-from sb3_gac.envs.wrappers import MEASURED, RECEIVED, SplitDictObservation
+from sb3_gac.envs.wrappers import SplitDictObservation
 from sb3_gac.evaluation.policies import EvaluatedPolicy
 
 EXTRA, PROGRAM = "video", "sb3-gac evaluate --video"

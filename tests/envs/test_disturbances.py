@@ -11,9 +11,9 @@ import sb3_gac  # noqa: F401, which registers the environments
 from sb3_gac.envs import DroppedFrames, History, PreviousAction, SensorDelay, SensorNoise, SplitDictObservation, make_vec
 from sb3_gac.envs.camera import CameraImage
 from sb3_gac.envs.disturbances import beneath, disturb
+from sb3_gac.envs.entries import RECEIVED
 from sb3_gac.envs.goals import AppendDesiredGoal
 from sb3_gac.envs.state import env_state, layers, restore_env_state
-from sb3_gac.envs.wrappers import RECEIVED
 from tests.envs.test_wrappers import IMAGE, PAIR, Reusing, Still, Strict
 
 ACTION = np.zeros(1, dtype=np.float32)
