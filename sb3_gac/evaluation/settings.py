@@ -119,15 +119,24 @@ class Environment:
     @property
     def beside(self) -> str:
         """
-        What disturbs the sensor beside the setting, in words: this package's wrappers in an undisturbed environment, or noise
-        in an environment that nobody can ask for it. It is empty if there is nothing.
+        What disturbs the sensor beside the setting, in words: this package's wrappers in an undisturbed environment, noise of
+        the simulator's own, or noise in an environment that nobody can ask for it. It is empty if there is nothing.
         """
         env = self.make(UNDISTURBED)
-        wrappers = [type(layer).__name__ for layer, _ in wrappers_of(env, PARTIAL) if _disturbs(layer)]
+        own = [type(layer).__name__ for layer, _ in wrappers_of(env, PARTIAL) if _disturbs(layer)]
         env.close()
-        if wrappers:
-            return f"what it has of its own: {' and '.join(wrappers)}"
+        if level := self.own_noise:
+            own.append(f"the task's own sensor noise, which {level}=0 leaves out")
+        if own:
+            return f"what it has of its own: {' and '.join(own)}"
         return "" if self.has_noise else "any noise that it may have of its own"
+
+    @property
+    def own_noise(self) -> str | None:
+        """Argument for the level of the simulator's own sensor noise; ``None`` if there is no such noise, or it is left out."""
+        suite = suite_of(self.env_id)
+        argument = None if suite is None else SUITES[suite].own_noise
+        return None if argument is None or self.kwargs.get(argument) == 0 else argument
 
     @property
     def has_noise(self) -> bool:

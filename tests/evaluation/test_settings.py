@@ -7,6 +7,7 @@ import yaml
 
 from sb3_gac.envs import DroppedFrames, History, SensorDelay, SensorNoise
 from sb3_gac.envs.state import layers
+from sb3_gac.envs.suites import suite_of
 from sb3_gac.evaluation.settings import UNDISTURBED, Environment, Setting, check_fits, environment_of_run, plan
 from sb3_gac.training.environments import make_wrapped
 from tests.evaluation.helpers import ENV, Walk
@@ -146,6 +147,18 @@ def test_disturbances_that_stay_are_named():
     assert Environment(NOISY).beside == "what it has of its own: SensorNoise"
     assert Environment("sb3_gac/Pendulum-v1").beside == ""
     assert Environment(ENV).beside == "any noise that it may have of its own"
+
+
+def test_noise_that_a_task_has_of_its_own_is_named(monkeypatch):
+    """The settings come on top of it, unless it is left out."""
+    robot = "sb3_gac/Go1JoystickFlatTerrain-v0"
+    assert suite_of(robot) == "playground"
+    for kwargs, argument in (({}, "noise_level"), ({"noise_level": 0.5}, "noise_level"), ({"noise_level": 0}, None)):
+        assert Environment(robot, kwargs).own_noise == argument
+    assert Environment("sb3_gac/Pendulum-v1").own_noise is None
+    monkeypatch.setattr(Environment, "own_noise", "noise_level")
+    beside = Environment("sb3_gac/Pendulum-v1").beside
+    assert beside == "what it has of its own: the task's own sensor noise, which noise_level=0 leaves out"
 
 
 @pytest.mark.parametrize("task", ["TigerDoor", "popgym-RepeatPreviousEasy"])

@@ -41,6 +41,8 @@ class Suite(NamedTuple):
     :param noise_std: standard deviation of the sensor noise in ``python -m sb3_gac.train`` if none is given
     :param privileged: values that the environments' argument ``privileged`` may have, the default first; empty if they have
         no such argument
+    :param own_noise: name of the simulator's argument for the level of sensor noise of its own, which ``noise_std`` comes on
+        top of, and which 0 leaves out; ``None`` if the simulator has no such noise
     """
 
     module: str
@@ -51,6 +53,7 @@ class Suite(NamedTuple):
     preset: str = "small"
     noise_std: float = 0.1
     privileged: tuple[str, ...] = ()
+    own_noise: str | None = None
 
     @property
     def environments(self) -> Mapping[str, Mapping[str, Any]]:
@@ -98,7 +101,12 @@ SUITES = {
     "tiger_door": Suite("sb3_gac.envs.suites.tiger_door", noise_std=0.0),
     "popgym": Suite("sb3_gac.envs.suites.popgym", extra="popgym"),
     "playground": Suite(
-        "sb3_gac.envs.suites.playground", sensor_noise=True, extra="envpool", preset="playground", noise_std=0.0
+        "sb3_gac.envs.suites.playground",
+        sensor_noise=True,
+        extra="envpool",
+        preset="playground",
+        noise_std=0.0,
+        own_noise="noise_level",
     ),
     "humanoid_bench": Suite(
         "sb3_gac.envs.suites.humanoid_bench",
