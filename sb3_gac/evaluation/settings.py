@@ -133,7 +133,7 @@ class Environment:
 
     @property
     def own_noise(self) -> str | None:
-        """Argument for the level of the simulator's own sensor noise; ``None`` if there is no such noise, or it is left out."""
+        """Argument for the level of the simulator's own sensor noise; ``None`` if there is none, or it is left out."""
         suite = suite_of(self.env_id)
         argument = None if suite is None else SUITES[suite].own_noise
         return None if argument is None or self.kwargs.get(argument) == 0 else argument
