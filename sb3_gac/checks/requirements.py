@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Collection, Mapping, Sequence
+from copy import deepcopy
 from math import ceil
 from typing import Any
 
@@ -150,26 +151,44 @@ def check_hindsight(buffer_class: Any, critics: Mapping[str, Collection[str]], d
 
 def check_rewards_of_goals(buffer_class: Any, buffer_kwargs: Mapping[str, Any], env: VecEnv) -> None:
     """
-    Check ``compute_reward`` by a call as ``HerReplayBuffer`` will make it, on goals of zeros.
+    Check ``compute_reward`` by calls as ``HerReplayBuffer`` will make them, on goals drawn from their spaces.
 
     :param buffer_class: value of the argument ``replay_buffer_class``; only ``HerReplayBuffer`` is checked
     :param buffer_kwargs: value of the argument ``replay_buffer_kwargs``
     :param env: environments, after their reset
-    :raises ValueError: if ``compute_reward`` does not reward many goals at once
+    :raises ValueError: if ``compute_reward`` does not reward many goals at once, or otherwise than one by one
     """
     if not _is_hindsight(buffer_class) or buffer_kwargs.get("copy_info_dict", False):  # the content of infos is not known
         return
     goals_of = [env.observation_space.spaces[goal] for goal in GOALS]  # type: ignore[attr-defined]
     shape = stored_shape(goals_of[0])
-    n_rows = next(n for n in range(2, len(shape) + 3) if n not in shape)  # so that a wrong axis shows
-    goals = [np.zeros((n_rows, *shape), dtype=goal.dtype) for goal in goals_of]
+    n_rows = max(shape, default=1) + 1  # so that a wrong axis shows, and an index of a row in place of a component
+    goals = [_samples(goal, n_rows).reshape(n_rows, *shape) for goal in goals_of]
+
+    def rewards_of(rows: slice) -> Any:
+        given = [of_rows[rows] for of_rows in goals]
+        return env.env_method("compute_reward", *given, [{} for _ in given[0]], indices=[0])[0]
+
     try:
-        (rewards,) = env.env_method("compute_reward", *goals, [{} for _ in range(n_rows)], indices=[0])
+        rewards = rewards_of(slice(None))
     except Exception as error:
         raise ValueError(f"compute_reward fails on {n_rows} rows of goals ({error!r}). {REWARDS_OF_GOALS}") from error
     if not isinstance(rewards, np.ndarray) or rewards.size != n_rows:
         said = f"{type(rewards).__name__} of shape {np.shape(rewards)}"
         raise ValueError(f"compute_reward returns {said} for {n_rows} rows of goals. {REWARDS_OF_GOALS}")
+    alone = np.array([np.ravel(rewards_of(slice(row, row + 1)))[0] for row in range(n_rows)])
+    if not np.allclose(rewards.ravel(), alone, rtol=1e-3, atol=1e-5, equal_nan=True):
+        raise ValueError(
+            f"compute_reward mixes rows of goals: it returns {rewards.ravel().tolist()} for {n_rows} rows at once, and "
+            f"{alone.tolist()} for the same rows one by one. {REWARDS_OF_GOALS}"
+        )
+
+
+def _samples(space: spaces.Space, count: int) -> np.ndarray:
+    """Samples of a space, always the same ones, which leave the space's own random numbers as they are."""
+    own = deepcopy(space)
+    own.seed(0)
+    return np.stack([own.sample() for _ in range(count)])
 
 
 def warn_of_other_rewards(

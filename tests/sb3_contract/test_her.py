@@ -176,12 +176,22 @@ def _off(achieved, desired):
     return np.linalg.norm(achieved - desired)
 
 
+def _copied_row(goals):
+    """The last component is meant, and where there are as many rows, the last of these is changed."""
+    changed = goals.copy()
+    if len(goals) > 2:
+        changed[2] = 0.5
+    return changed
+
+
 UNFIT = {
     "a number": (lambda *goals: float(_off(*goals[:2])), r"returns float of shape \(\) for 3 rows of goals"),
     "numpy's": (lambda *goals: _off(*goals[:2]), r"returns float32 of shape \(\) for 3 rows"),
     "a list": (lambda *goals: [0.0] * len(goals[0]), r"returns list of shape \(3,\)"),
     "the other axis": (lambda *goals: goals[0].sum(axis=0), r"returns ndarray of shape \(2,\) for 3 rows"),
     "a branch": (lambda *goals: -1.0 if (goals[0] == goals[1])[:, 0] else 0.0, "fails on 3 rows of goals .*ambiguous"),
+    "a row for a component": (lambda *goals: _distances(_copied_row(goals[0]), *goals[1:]), "mixes rows of goals: it returns"),
+    "a mean": (lambda *goals: _distances(*goals) - _distances(*goals).mean(), "mixes rows of goals: it returns"),
 }
 
 
