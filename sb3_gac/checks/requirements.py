@@ -163,7 +163,7 @@ def check_rewards_of_goals(buffer_class: Any, buffer_kwargs: Mapping[str, Any], 
     goals_of = [env.observation_space.spaces[goal] for goal in GOALS]  # type: ignore[attr-defined]
     shape = stored_shape(goals_of[0])
     n_rows = max(shape, default=1) + 1  # so that a wrong axis shows, and an index of a row in place of a component
-    goals = [_samples(goal, n_rows).reshape(n_rows, *shape) for goal in goals_of]
+    goals = [_samples(goal, n_rows, seed).reshape(n_rows, *shape) for seed, goal in enumerate(goals_of)]
 
     def rewards_of(rows: slice) -> Any:
         given = [of_rows[rows] for of_rows in goals]
@@ -184,10 +184,10 @@ def check_rewards_of_goals(buffer_class: Any, buffer_kwargs: Mapping[str, Any], 
         )
 
 
-def _samples(space: spaces.Space, count: int) -> np.ndarray:
-    """Samples of a space, always the same ones, which leave the space's own random numbers as they are."""
+def _samples(space: spaces.Space, count: int, seed: int) -> np.ndarray:
+    """Samples of a space, always the same ones for a seed, which leave the space's own random numbers as they are."""
     own = deepcopy(space)
-    own.seed(0)
+    own.seed(seed)
     return np.stack([own.sample() for _ in range(count)])
 
 
