@@ -65,12 +65,11 @@ def about_changed_code(specs: Iterable[RunSpec], runs: Path) -> list[str]:
     changed: dict[str, list[Path]] = {}
     now: dict[str, dict[str, str]] = {}
     for spec in specs:
-        path = spec.directory(runs) / "config.yaml"
-        if not path.exists():
+        path, key = spec.directory(runs) / "config.yaml", str(spec.environment)
+        now[key] = now.get(key) or code_of(spec)
+        if not now[key] or not path.exists():
             continue
         before = made_with(yaml.safe_load(path.read_text(encoding="utf-8")))
-        key = str(spec.environment)
-        now[key] = now.get(key) or code_of(spec)
         for name, digits in now[key].items():
             if {one["versions"].get(name, digits) for one in before} != {digits}:
                 changed.setdefault(name, []).append(path.parent)

@@ -158,7 +158,7 @@ CASES = {
     "GRU for the learner alone": Case(GAC, of_model={"policy_kwargs": {"rnn_type": {"learner": "gru"}}}, cell="Gru"),
     "GRU for critics alone": Case(GAC, of_model={"policy_kwargs": {"rnn_type": {"critic": "gru"}}}, cell="Gru"),
     "TGRL": Case(TGRL, {"teacher_coef": 0.6}),
-    "TGRL, clipped, n steps": Case(TGRL, CLIPPED | {"teacher_coef": 2.0}, of_model=N_STEPS),
+    "TGRL, clipped": Case(TGRL, CLIPPED | {"teacher_coef": 2.0}),
     "TGRL, discrete": Case(TGRL, {"teacher_coef": 0.6, "target_entropy": 0.8}, discrete=True),
     "TGRL, GRU": Case(TGRL, {"teacher_coef": 0.6}, cell="Gru"),
     "TGRL, GRU for actors alone": Case(

@@ -8,7 +8,7 @@ import warnings
 import pytest
 from typing_extensions import Unpack
 
-from sb3_gac import GAC, AsymmetricSAC, GACShare, GACWithoutQ
+from sb3_gac import GAC, TGRL, AsymmetricSAC, GACShare, GACWithoutQ
 from sb3_gac.base.arguments import OffPolicyArguments, PositionalArguments
 from sb3_gac.base.off_policy import AsymmetricOffPolicyAlgorithm
 from sb3_gac.checks.values import check_not_negative
@@ -73,6 +73,8 @@ def test_every_argument_is_described_where_it_is_written(cls):
 def test_by_position_is_by_name(cls):
     values = [1e-3, 500, 7, 8, 0.1, 0.9, (3, "step"), 2, None, None, {"storage_dtype": "float16"}, False, 2, 0.3, 5, -2.0]
     assert len(values) == len(BY_POSITION) - 2
+    if cls is TGRL:
+        values[BY_POSITION.index("n_steps") - 2] = 1  # it takes no other
     by_position = cls("MultiInputPolicy", TwoViewBandit(), *values)
     by_name = cls(policy="MultiInputPolicy", env=TwoViewBandit(), **dict(zip(BY_POSITION[2:], values, strict=True)))
     for name, value in zip(BY_POSITION[2:], values, strict=True):

@@ -126,12 +126,15 @@ class PlainReplay:
     def batch(self, samples: Any) -> Batch:
         """
         :param samples: that the replay buffer gave: of transitions, or with a mask, of sequences. Which ones these are is
-            told by their first observations, and how many steps only bring memories up by the mask; all else is looked up
+            told by their first observations, and by the mask how many steps only bring memories up and how many count; all
+            else is looked up
         """
         sequences = hasattr(samples, "mask")
         first = {key: (value[0] if sequences else value).numpy() for key, value in samples.observations.items()}
         places = [self._place({key: value[row] for key, value in first.items()}) for row in range(len(first["partial"]))]
-        return self._of_sequences(places, samples.mask.argmax(dim=0).tolist()) if sequences else self._of_transitions(places)
+        if not sequences:
+            return self._of_transitions(places)
+        return self._of_sequences(places, samples.mask.argmax(dim=0).tolist(), samples.mask.sum(dim=0).int().tolist())
 
     def _place(self, obs: dict[str, np.ndarray]) -> tuple[Recorded, int]:
         distances = np.abs(self._seen - _flat(obs)).max(axis=1)
@@ -165,13 +168,17 @@ class PlainReplay:
     def _is_learned(self, step: Step) -> float:
         return float(not self.mask_truncations or step.terminated or not step.ended)
 
-    def _of_sequences(self, places: list[tuple[Recorded, int]], burn_in: list[int]) -> Batch:
+    def _of_sequences(self, places: list[tuple[Recorded, int]], burn_in: list[int], counted: list[int]) -> Batch:
         """Side by side; what pads the short ones, their last step again and again, must not matter."""
         episodes = []
-        for (env, t), before in zip(places, burn_in, strict=True):
+        for (env, t), before, count in zip(places, burn_in, counted, strict=True):
             end = next(end for end in range(t, len(env.steps)) if env.steps[end].ended)
             rest = env.steps[t : end + 1]
-            episodes.append(rest if self.sequence_length is None else rest[: before + self.sequence_length])
+            if self.sequence_length is not None:  # fewer steps at an episode's start or end alone
+                is_cut = len(rest) == before + count or t + before == 0 or env.steps[t + before - 1].ended
+                assert count == self.sequence_length or (count < self.sequence_length and is_cut)
+                rest = rest[: before + count]
+            episodes.append(rest)
         length = max(len(episode) for episode in episodes)
         padded = [episode + [episode[-1]] * (length - len(episode)) for episode in episodes]
         observations = [_stacked([self.normalised(obs) for obs in _observations(one, length + 1)]) for one in episodes]
