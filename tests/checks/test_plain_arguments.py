@@ -11,7 +11,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_gac import GAC, AsymmetricSAC
+from sb3_gac import GAC, TGRL, AsymmetricSAC
 from sb3_gac.checks.arguments import PlainSchedule, constructor_arguments
 from sb3_gac.checks.values import plain
 from tests.helpers import Recall, TwoViewBandit, optimizers_of, small_model
@@ -125,7 +125,7 @@ GACS_OWN = {
 
 @pytest.mark.parametrize("cls", ALGORITHMS)
 def test_a_model_made_with_foreign_numbers_is_saved_loaded_and_resumed(cls, tmp_path):
-    arguments = SHARED | (GACS_OWN if issubclass(cls, GAC) else {})
+    arguments = SHARED | (GACS_OWN if issubclass(cls, GAC) else {}) | ({"n_steps": np.int64(1)} if cls is TGRL else {})
     model = small_model(cls=cls, **arguments).learn(20)
     assert model._n_updates > 0
     for argument in constructor_arguments(cls):
