@@ -12,14 +12,8 @@ from typing import Any, NamedTuple, TypeAlias
 import pandas as pd
 import yaml
 
-from benchmarks.config import (
-    in_present_names,
-    normalization,
-    read_algorithm,
-    resolve,
-    settings_in_present_names,
-    with_defaults,
-)
+from benchmarks.config import normalization, read_algorithm, resolve
+from benchmarks.recorded import in_present_names, settings_in_present_names, with_defaults
 from benchmarks.suite import UNSAID, RunSpec, made_with
 from benchmarks.tidy import NAMES, NEEDED, NO_NOISE, file_of, read_tidy
 
@@ -132,7 +126,7 @@ def _changed(spec: RunSpec, configuration: Mapping[str, Any]) -> list[str]:
 def conflicts(name: str, recorded: Any, other: Any) -> list[str]:
     """
     Compare recorded arguments with others. One that was not recorded has no other value: see
-    :func:`~benchmarks.config.with_defaults` for the value that it had.
+    :func:`~benchmarks.recorded.with_defaults` for the value that it had.
 
     :param name: name of the arguments, with which the names that are returned begin
     :param recorded: arguments as they were recorded, or one of them

@@ -22,12 +22,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_gac
 from benchmarks.checkpoint import TIMING, checkpoints_of, read_seconds, write_atomically, write_timing
-from benchmarks.config import POLICY, fingerprint, in_present_names, normalization, resolve, settings_in_present_names
+from benchmarks.config import POLICY, fingerprint, normalization, resolve
 from benchmarks.environments import EVAL_SEED, make_envs
 from benchmarks.external import Program
 from benchmarks.finished import is_finished, name_of
 from benchmarks.own_code import code_of
 from benchmarks.program import read_rows, rows_as_text
+from benchmarks.recorded import in_present_names, settings_in_present_names
 from benchmarks.suite import RUNS, UNSAID, RunSpec, made_with, needed_runs, read_suite
 from sb3_gac.base.recording import holds_every_step
 from sb3_gac.checkpoint.lock import locked

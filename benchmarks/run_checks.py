@@ -9,8 +9,9 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
-from benchmarks.config import read_algorithm, with_defaults
+from benchmarks.config import read_algorithm
 from benchmarks.finished import FinishedRun, conflicts, kind_of
+from benchmarks.recorded import with_defaults
 from benchmarks.tidy import CELL, NO_NOISE
 
 

@@ -306,11 +306,10 @@ def algorithm_arguments(options: Namespace) -> dict[str, Any]:
         own["buffer_size"] = min(1_000_000, max(options.steps, 1_000))
     if options.teacher is not None:
         own[TEACHER] = str(options.teacher)
-    # Without the whole state in one entry, critics need all entries
-    without_state = not (options.privileged in (None, "state") if options.task else options.whole_state)
-    own |= {"role_keys": None} if without_state else {}
-    noise = float(np.mean(options.noise or 0.0))
-    of_preset = preset(options.preset, algorithm=kind, task=options.task, noise=noise)
+    if not (options.task or options.whole_state):  # without the whole state in one entry, critics need all entries
+        own["role_keys"] = None
+    task = {"task": options.task, "privileged": options.privileged} if options.task else {}
+    of_preset = preset(options.preset, algorithm=kind, noise=float(np.mean(options.noise or 0.0)), **task)
     return instantiate(merge(of_preset, merge(own, options.overrides)))
 
 

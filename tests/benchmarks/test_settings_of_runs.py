@@ -11,12 +11,13 @@ import yaml
 import benchmarks.aggregate
 import benchmarks.bootstrap
 from benchmarks.aggregate import finished_runs, origins
-from benchmarks.config import resolve, with_defaults
+from benchmarks.config import resolve
 from benchmarks.finished import FinishedRun, conflicts, is_finished, name_of, read_results
 from benchmarks.launch import jobs_left
 from benchmarks.page.document import _origin
 from benchmarks.page.summary import in_short
 from benchmarks.page.tables import with_surroundings
+from benchmarks.recorded import with_defaults
 from benchmarks.run import _refuse_other_settings, run
 from benchmarks.suite import RunSpec, read_suite
 from sb3_gac import GAC
